@@ -1,0 +1,1 @@
+"""Statistical geometry: invariants, exact moments, Monte Carlo, recognition, figures and the report."""

@@ -1,0 +1,1 @@
+"""A virtual BOLT behind a virtual radio: the real bleak client talks to it."""

@@ -1,0 +1,1 @@
+"""Cameras, the track of the robot's LED, true crossings, and whether the lines are isotropic."""
