@@ -1,0 +1,39 @@
+# Everything runs in the checkout's own .venv, which the first target to need it sets up.
+PYTHON ?= python3
+BIN := .venv/bin
+ROOMS := lab projector tracking robot analysis
+
+.PHONY: setup session test check bench docs clean
+
+setup: .venv/ready
+
+.venv/ready: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "chordlab needs Python 3.11 or newer: make $(MAKECMDGOALS) PYTHON=python3.12"; exit 2; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,projector]'
+	@touch $@
+
+# A full session on the virtual bench: the Eiffel Tower, a virtual BOLT, a filmed floor, a report.
+session: setup
+	$(BIN)/chordlab run --simulate --shape eiffel $(ARGS)
+
+test: setup
+	$(BIN)/python -m pytest -n 2 --cov --cov-report=term --cov-fail-under=90 $(ARGS)
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports --no-logo
+	$(BIN)/codespell $(ROOMS) tests docs README.md CHANGELOG.md Makefile pyproject.toml
+
+bench: setup
+	$(BIN)/python -m pytest tests/bench --benchmark-only --benchmark-columns=min,median,max,rounds $(ARGS)
+
+# The documents are Markdown that reads as it is; this proves that their links and commands hold.
+docs: setup
+	$(BIN)/python -m pytest -q tests/docs $(ARGS)
+
+clean:
+	rm -rf .venv build dist

@@ -1,0 +1,160 @@
+"""Which entry of a dictionary is it: the common face of the recognisers, and the paper's own (A, P) one.
+
+The per-line recogniser, which needs some ten times fewer lines, is `analysis.perline`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from analysis.estimate import ratio_bias
+from analysis.invariants import area_cm2, perimeter_cm
+from analysis.quadrature import Moments
+from lab.base.errors import RequestError
+
+Floats = NDArray[np.float64]
+
+FIRST_POSTERIOR_N = 10
+
+
+@runtime_checkable
+class Recogniser(Protocol):
+    """Takes crossing lines one by one and says how probable each entry of its dictionary has become."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The entries, in the dictionary's order."""
+        ...
+
+    @property
+    def n(self) -> int:
+        """Crossing lines taken in so far."""
+        ...
+
+    def update(self, k: int, l1_cm: float, l3_cm3: float) -> None:
+        """Take in one line. A line with k = 0 did not cross the shape and changes nothing."""
+        ...
+
+    def update_many(self, k: ArrayLike, l1_cm: ArrayLike, l3_cm3: ArrayLike) -> None:
+        """Take in many lines, arrays of shape (lines,)."""
+        ...
+
+    def posterior(self) -> dict[str, float]:
+        """Probability of each entry; they sum to 1."""
+        ...
+
+    def ranked(self) -> list[tuple[str, float]]:
+        """(name, probability), the most probable first."""
+        ...
+
+    def reset(self) -> None:
+        """Forget every line."""
+        ...
+
+
+class GaussianRecogniser:
+    """The paper's recogniser: area and perimeter against each entry, by Bayes' rule.
+
+    The estimate (Â, P̂) after N lines is taken as normal about the entry's own area and perimeter with the
+    entry's own full 2x2 covariance/N: A and P are correlated (up to 0.98 for a tower), so that axis-aligned
+    ellipses would mislead. The ratio bias of order 1/N is included.
+
+    Before `FIRST_POSTERIOR_N` lines the posterior is the prior: Â and P̂ are ratios of means of strongly skewed
+    quantities, and over a few lines nothing like normal, so that a single long chord would "prove" an
+    entry. For intricate shapes the skew shows up to a hundred lines.
+
+    Args:
+        entries: exact moments of each entry, from `analysis.quadrature.exact_moments`.
+        prior: relative prior weight of each entry, > 0; equal without it.
+    """
+
+    def __init__(self, entries: Mapping[str, Moments], *, prior: Mapping[str, float] | None = None) -> None:
+        self.names = tuple(entries)
+        self._log_prior = log_prior(self.names, prior)
+        moments = list(entries.values())
+        self._size = np.array([[m.area_cm2, m.perimeter_cm] for m in moments])
+        self._relative = np.array([m.relative for m in moments])
+        self._bias = np.array([ratio_bias(m.mean, m.covariance) for m in moments])
+        self.reset()
+
+    @property
+    def n(self) -> int:
+        """Crossing lines taken in so far."""
+        return self._n
+
+    def reset(self) -> None:
+        """Forget every line."""
+        self._n = 0
+        self._sums = np.zeros(3)
+
+    def update(self, k: int, l1_cm: float, l3_cm3: float) -> None:
+        """Take in one line; k = 0 changes nothing."""
+        if k >= 1:
+            self._n += 1
+            self._sums += (k, l1_cm, l3_cm3)
+
+    def update_many(self, k: ArrayLike, l1_cm: ArrayLike, l3_cm3: ArrayLike) -> None:
+        """Take in many lines, arrays of shape (lines,)."""
+        values = np.column_stack([np.asarray(column, dtype=float).ravel() for column in (k, l1_cm, l3_cm3)])
+        crossing = values[values[:, 0] >= 1]
+        self._n += len(crossing)
+        self._sums += crossing.sum(axis=0)
+
+    def posterior(self) -> dict[str, float]:
+        """Probability of each entry from the running means; the prior before `FIRST_POSTERIOR_N` lines."""
+        if self._n < FIRST_POSTERIOR_N:
+            return normalised(self.names, self._log_prior)
+        k, l1, l3 = self._sums / self._n
+        return self.posterior_at(float(area_cm2(l1, l3)), float(perimeter_cm(k, l1, l3)), self._n)
+
+    def ranked(self) -> list[tuple[str, float]]:
+        """(name, probability), the most probable first."""
+        return rank(self.posterior())
+
+    def posterior_at(self, area: float, perimeter: float, n: float) -> dict[str, float]:
+        """Probability of each entry for an estimate (cm², cm) from ``n`` lines: the likelihood landscape."""
+        distance2, log_norm = self._terms(area, perimeter, n)
+        return normalised(self.names, self._log_prior - 0.5 * distance2 - log_norm)
+
+    def misfit(self, area: float, perimeter: float, n: float) -> dict[str, float]:
+        """Squared Mahalanobis distance to each entry, χ² with 2 degrees of freedom if that entry is true.
+
+        When all of them are above 14 (p < 0.001) the shape is in no entry, whatever the posterior says.
+        """
+        distance2, _ = self._terms(area, perimeter, n)
+        return {name: float(value) for name, value in zip(self.names, distance2, strict=True)}
+
+    def _terms(self, area: float, perimeter: float, n: float) -> tuple[Floats, Floats]:
+        covariance = self._relative / n
+        relative_error = np.array([area, perimeter]) / self._size - 1 - self._bias / n
+        # In relative units; the determinant of the absolute covariance then needs the sizes.
+        distance2 = np.einsum("ei,eij,ej->e", relative_error, np.linalg.inv(covariance), relative_error)
+        log_norm = 0.5 * np.linalg.slogdet(covariance)[1] + np.log(self._size).sum(axis=1)
+        return distance2, log_norm
+
+
+def log_prior(names: tuple[str, ...], prior: Mapping[str, float] | None) -> Floats:
+    """Log prior of each name, not normalised. Raises RequestError for an empty dictionary or a bad weight."""
+    if not names:
+        raise RequestError("the dictionary is empty; give at least one entry to recognise")
+    if prior is None:
+        return np.zeros(len(names))
+    weights = np.array([prior.get(name, 0.0) for name in names])
+    if not (weights > 0).all() or not np.isfinite(weights).all():
+        raise RequestError("every entry needs a prior weight above 0")
+    return np.log(weights)
+
+
+def normalised(names: tuple[str, ...], log_weights: Floats) -> dict[str, float]:
+    """Turn log weights into probabilities; the largest is taken off first, so that nothing under- or overflows."""
+    weights = np.exp(log_weights - log_weights.max())
+    return {name: float(value) for name, value in zip(names, weights / weights.sum(), strict=True)}
+
+
+def rank(posterior: Mapping[str, float]) -> list[tuple[str, float]]:
+    """Sort a posterior, the most probable first; ties keep the dictionary's order."""
+    return sorted(posterior.items(), key=lambda item: -item[1])

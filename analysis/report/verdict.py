@@ -1,0 +1,325 @@
+"""What the session shows, in plain language: a headline, findings with their numbers, and what to do next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.estimate import Estimate
+from analysis.figures.camera import agreement
+from analysis.figures.values import Entry
+from analysis.report.result import SessionResult
+from analysis.report.words import count, number, p_value, percent, plus_minus, probability, signed
+
+Floats = NDArray[np.float64]
+Tone = Literal["good", "fair", "poor"]
+
+UNLIKELY = 0.01  # a joint deviation rarer than this is a bias, not chance
+SCALE_TOLERANCE = 0.01
+MISSED_TOLERANCE = 0.02
+FEW_LINES = 100  # below, the estimates of intricate shapes are skewed and a Gaussian ellipse only a rough guide
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing the session shows: ``topic`` in a word or two, ``text`` in whole sentences."""
+
+    topic: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """Something that spoils the session, and what to do next."""
+
+    what: str
+    next_step: str
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The conclusion: ``tone`` good (nothing to do), fair (usable, see the problems) or poor."""
+
+    tone: Tone
+    headline: str
+    findings: tuple[Finding, ...]
+    problems: tuple[Problem, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Deviation:
+    """Measured minus exact: relative, in standard deviations, and how probable so large a joint one is by chance."""
+
+    area_rel: float
+    perimeter_rel: float
+    area_sigmas: float
+    perimeter_sigmas: float
+    chance: float
+
+
+def deviation(measured: Estimate, exact: Entry) -> Deviation:
+    """Compare an estimate with the exact values.
+
+    The measure is the exact scatter of N lines on the projected shape, not the robot's own ±: as long as the rare long
+    chords are missing from a sample, A and its uncertainty are both too small. ``chance`` is exp(−d²/2) with d² the
+    squared Mahalanobis distance (χ² with two degrees of freedom); NaN where the scatter is unknown or singular.
+    """
+    gap = np.array([measured.area_cm2 - exact.area_cm2, measured.perimeter_cm - exact.perimeter_cm])
+    scatter = exact.covariance_at(measured.n)
+    sigma = np.sqrt(np.maximum(np.diag(scatter), 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        in_sigmas = gap / sigma
+    return Deviation(
+        area_rel=float(gap[0] / exact.area_cm2),
+        perimeter_rel=float(gap[1] / exact.perimeter_cm),
+        area_sigmas=float(in_sigmas[0]),
+        perimeter_sigmas=float(in_sigmas[1]),
+        chance=float(np.exp(-_squared_distance(gap, scatter) / 2)),
+    )
+
+
+def lines_to_tell_apart(one: Entry, other: Entry, stop_at: float) -> float:
+    """Crossing lines after which (A, P) tell ``one`` from ``other`` with posterior ``stop_at`` in 95 of 100 sessions.
+
+    With d² the squared distance for one line, the log odds after N lines are normal, mean N d²/2 and variance N d²;
+    x = √(N d²) must satisfy x²/2 − 1.645 x = ln(s/(1 − s)). Infinite for equal (A, P).
+    """
+    gap = np.array([one.area_cm2 - other.area_cm2, one.perimeter_cm - other.perimeter_cm])
+    squared = _squared_distance(gap, (one.covariance_per_line + other.covariance_per_line) / 2)
+    odds = np.log(stop_at / (1 - stop_at)) if stop_at < 1 else np.inf
+    return float((1.645 + np.sqrt(1.645**2 + 2 * max(odds, 0.0))) ** 2 / squared) if squared > 1e-9 else float("inf")
+
+
+def decided_at(result: SessionResult) -> int | None:
+    """The N from which on the final leader stayed ahead with posterior ≥ ``stop_at``; None if it never settled."""
+    estimates = result.estimates
+    if estimates.empty or not result.ranking or not {"leading", "posterior"} <= set(estimates.columns):
+        return None
+    ordered = estimates.sort_values("n")
+    ahead = (ordered["leading"] == result.ranking[0][0]).to_numpy(dtype=bool)
+    sure = ahead & (np.asarray(ordered["posterior"], dtype=float) >= result.stop_at)
+    if not sure[-1]:
+        return None
+    doubts = np.flatnonzero(~sure)
+    return int(np.asarray(ordered["n"])[doubts[-1] + 1 if doubts.size else 0])
+
+
+def verdict_of(result: SessionResult) -> Verdict:
+    """Judge a session by its tables alone: what was recognised and how far to trust it."""
+    measured = result.measured
+    if measured is None:
+        return Verdict(
+            tone="poor",
+            headline=f"Nothing was measured: none of the {count(result.runs, 'run')} crossed the shape.",
+            findings=(),
+            problems=(
+                Problem(
+                    "The robot reported no line with a lit stretch.",
+                    "Check that the projector shows the shape, that the robot rolls inside the arena, and that its "
+                    "light levels separate (`chordlab calibrate robot`).",
+                ),
+            ),
+        )
+    tone, headline = _headline(result, measured)
+    findings = (
+        _recognition(result, measured),
+        *_sizes(result, measured),
+        _camera(result, measured),
+        _randomness(result),
+    )
+    problems = [*_of_the_recognition(result, measured), *_of_the_sizes(result, measured), *_of_the_runs(result)]
+    if tone == "good" and problems:
+        tone = "fair"
+    return Verdict(tone, headline, findings, tuple(problems))
+
+
+def _headline(result: SessionResult, measured: Estimate) -> tuple[Tone, str]:
+    lines = count(measured.n, "crossing line")
+    if not result.ranking:
+        return "fair", f"Measured after {lines}; there was no dictionary to recognise the shape from."
+    best, posterior = result.ranking[0]
+    title = result.title_of(best)
+    if result.name not in {name for name, _ in result.ranking}:
+        return "fair", f"{result.title} is not in the dictionary; after {lines} the robot takes it for: {title}."
+    sure = probability(posterior)
+    if posterior < result.stop_at:
+        projected = "" if best == result.name else f", but {result.title} was projected"
+        return "fair", f"Undecided: {title} leads with posterior {sure} after {lines}{projected}."
+    if best != result.name:
+        return "poor", f"Mistaken: {result.title} was projected, {title} is favoured ({sure}) after {lines}."
+    return "good", f"Recognised: {title}, posterior {sure} after {lines}."
+
+
+def _recognition(result: SessionResult, measured: Estimate) -> Finding:
+    runs = (
+        f"{count(measured.n, 'line')} of {count(result.runs, 'arena run')} crossed the shape "
+        f"({percent(measured.n / result.runs, 0) if result.runs else 'unknown'})."
+    )
+    if not result.ranking:
+        return Finding("Lines", runs)
+    best, posterior = result.ranking[0]
+    text = f"{runs} {result.title_of(best)} has posterior {probability(posterior)}"
+    if len(result.ranking) > 1:
+        rival, other = result.ranking[1]
+        text += f", the next is {result.title_of(rival)} with {probability(other)}"
+    settled = decided_at(result)
+    text += "." if settled is None else f"; from N = {settled} on it stayed above {percent(result.stop_at, 0)}."
+    return Finding("Recognition", text)
+
+
+def _sizes(result: SessionResult, measured: Estimate) -> list[Finding]:
+    off = deviation(measured, result.exact)
+    shape = result.exact
+    return [
+        Finding(
+            "Area",
+            f"A = {plus_minus(measured.area_cm2, measured.sigma_area_cm2, 'cm²')}; projected "
+            f"{number(shape.area_cm2)} cm²: {signed(100 * off.area_rel)} %, {signed(off.area_sigmas)} σ.",
+        ),
+        Finding(
+            "Perimeter",
+            f"P = {plus_minus(measured.perimeter_cm, measured.sigma_perimeter_cm, 'cm')}; projected "
+            f"{number(shape.perimeter_cm)} cm: {signed(100 * off.perimeter_rel)} %, {signed(off.perimeter_sigmas)} σ.",
+        ),
+    ]
+
+
+def _camera(result: SessionResult, measured: Estimate) -> Finding:
+    sentences: list[str] = []
+    if result.camera is not None:
+        camera = result.camera
+        sentences.append(
+            f"From its own crossings the camera gives A = {number(camera.area_cm2)} cm² and "
+            f"P = {number(camera.perimeter_cm)} cm; the robot differs from it by "
+            f"{signed(100 * (measured.area_cm2 / camera.area_cm2 - 1))} % in A and "
+            f"{signed(100 * (measured.perimeter_cm / camera.perimeter_cm - 1))} % in P."
+        )
+    found = None if result.chord_pairs is None else agreement(result.chord_pairs)
+    if found is not None:
+        low, high = found.limits_cm
+        sentences.append(
+            f"Over {count(found.chords, 'matched chord')} robot minus camera is {signed(found.bias_cm, 2)} cm on "
+            f"average, 95 % between {signed(low, 2)} and {signed(high, 2)} cm; scale {number(found.scale, 3)}."
+        )
+    if result.chords_missed is not None and result.chords_extra is not None:
+        sentences.append(
+            f"The robot missed {count(result.chords_missed, 'chord')} and saw {result.chords_extra} too many."
+        )
+    if not sentences:
+        sentences.append("There was no video: nothing checks the robot's chords one by one.")
+    return Finding("Camera", " ".join(sentences))
+
+
+def _randomness(result: SessionResult) -> Finding:
+    if result.isotropy is None:
+        return Finding("Randomness", "Whether the lines were isotropic was not tested, for want of tracked lines.")
+    found = result.isotropy
+    opening = found.verdict or ("The lines look random." if found.passed else "The lines are not random enough.")
+    if not found.p_values:
+        return Finding("Randomness", opening)
+    worst = min(found.p_values, key=found.p_values.__getitem__)
+    return Finding("Randomness", f"{opening} Smallest p-value: {p_value(found.p_values[worst])} ({worst}).")
+
+
+def _of_the_recognition(result: SessionResult, measured: Estimate) -> list[Problem]:
+    problems: list[Problem] = []
+    if result.ranking and (result.ranking[0][0] != result.name or result.ranking[0][1] < result.stop_at):
+        others = {name: entry for name, entry in result.dictionary.items() if name != result.name}
+        if others:
+            needed, rival = max(
+                (lines_to_tell_apart(result.exact, entry, result.stop_at), name) for name, entry in others.items()
+            )
+            problems.append(_undecided(result, measured, rival, needed))
+    if measured.n < FEW_LINES:
+        problems.append(
+            Problem(
+                f"Only {count(measured.n, 'line')} crossed the shape; below {FEW_LINES} the uncertainties are rough.",
+                f"Roll on to at least {FEW_LINES} crossing lines (`chordlab run --resume`).",
+            )
+        )
+    return problems
+
+
+def _undecided(result: SessionResult, measured: Estimate, rival: str, needed: float) -> Problem:
+    title = result.title_of(rival)
+    if not np.isfinite(needed):
+        return Problem(
+            f"{result.title} and {title} have the same area and perimeter: (A, P) cannot tell them apart.",
+            "Recognise line by line instead of by (A, P): `chordlab recognize`.",
+        )
+    lines = round(needed, -int(np.floor(np.log10(max(needed, 1.0)))) + 1)
+    if needed > measured.n:
+        step = f"By theory about {lines:.0f} crossing lines settle it: roll on (`chordlab run --resume`)."
+    else:
+        step = (
+            f"By theory about {lines:.0f} lines suffice: the measurement is biased rather than short. Calibrate the "
+            "robot and the projector, or use a dictionary that is matched to the sensor."
+        )
+    return Problem(f"The recognition is not settled; the hardest rival is {title}.", step)
+
+
+def _of_the_sizes(result: SessionResult, measured: Estimate) -> list[Problem]:
+    problems: list[Problem] = []
+    off = deviation(measured, result.exact)
+    if off.chance < UNLIKELY:
+        stretched = abs(off.area_rel - 2 * off.perimeter_rel) < 0.5 * abs(off.area_rel)
+        problems.append(
+            Problem(
+                f"A and P deviate more than chance allows (p {p_value(off.chance)}).",
+                "A deviates about twice as much as P, as a wrong speed or scale makes it: `chordlab calibrate robot`, "
+                "then check the projector's plane."
+                if stretched
+                else "Check the light threshold, the sensor's footprint and lost short chords; a slower robot or "
+                "faster sampling mends the latter.",
+            )
+        )
+    found = None if result.chord_pairs is None else agreement(result.chord_pairs)
+    if found is not None and abs(found.scale - 1) > SCALE_TOLERANCE:
+        problems.append(
+            Problem(
+                f"The robot's lengths are {signed(100 * (found.scale - 1))} % off the camera's; that puts "
+                f"{signed(100 * (found.scale**2 - 1))} % on A.",
+                "Calibrate the robot's speed (`chordlab calibrate robot`), or check the camera's calibration.",
+            )
+        )
+    if found is not None and result.chords_missed:
+        missed = result.chords_missed / (found.chords + result.chords_missed)
+        if missed > MISSED_TOLERANCE:
+            problems.append(
+                Problem(
+                    f"The robot missed {percent(missed)} of the chords, which lowers P.",
+                    "Lower the speed or shorten the sampling interval: chords shorter than one step are lost.",
+                )
+            )
+    return problems
+
+
+def _of_the_runs(result: SessionResult) -> list[Problem]:
+    problems: list[Problem] = []
+    cut = int((result.lines["ended"] != "bump").sum())
+    if result.runs and cut / result.runs > MISSED_TOLERANCE:
+        kinds = result.lines.loc[result.lines["ended"] != "bump", "ended"].value_counts()
+        listed = ", ".join(f"{number_of} by {kind}" for kind, number_of in kinds.items())
+        problems.append(
+            Problem(
+                f"{count(cut, 'run')} did not end at the wall ({listed}); cut runs lower A.",
+                "Charge the robot, clear the floor and stay in radio range, then repeat the session.",
+            )
+        )
+    if result.isotropy is not None and not result.isotropy.passed:
+        problems.append(
+            Problem(
+                "The runs were not isotropic and homogeneous, so that A and P may be biased.",
+                "Turn by the cosine law at the wall and check that the bumps give the wall's normal.",
+            )
+        )
+    return problems
+
+
+def _squared_distance(gap: Floats, covariance: Floats) -> float:
+    if not np.isfinite(covariance).all() or np.linalg.matrix_rank(covariance) < 2:
+        return float("nan")
+    return float(gap @ np.linalg.solve(covariance, gap))

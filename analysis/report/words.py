@@ -1,0 +1,64 @@
+"""Numbers as people write them: as many digits as their uncertainty allows, a true minus, grouped thousands."""
+
+from __future__ import annotations
+
+import math
+
+_GROUP = "\u202f"
+
+
+def signed(value: float, digits: int = 1) -> str:
+    """Write a number with its sign: ``signed(-0.04)`` is "0.0", not "−0.0"."""
+    if not math.isfinite(value):
+        return "unknown"
+    text = f"{value:+.{digits}f}"
+    if float(text) == 0:
+        return text[1:]
+    return text.replace("-", "−")
+
+
+def number(value: float, digits: int = 1) -> str:
+    """Write a number with a true minus; what is not finite is "unknown"."""
+    return f"{value:.{digits}f}".replace("-", "−") if math.isfinite(value) else "unknown"
+
+
+def decimals_for(sigma: float) -> int:
+    """Decimals that show two digits of an uncertainty, at least none and at most six; one without an uncertainty."""
+    if not math.isfinite(sigma) or sigma <= 0:
+        return 1
+    return min(max(0, 1 - math.floor(math.log10(sigma))), 6)
+
+
+def plus_minus(value: float, sigma: float, unit: str) -> str:
+    """Write value ± σ with two digits of σ: ``plus_minus(687.31, 38.4, "cm²")`` is "687 ± 38 cm²"."""
+    digits = decimals_for(sigma)
+    if not math.isfinite(sigma):
+        return f"{number(value, digits)} {unit} (uncertainty unknown)"
+    return f"{number(value, digits)} ± {number(sigma, digits)} {unit}"
+
+
+def percent(share: float, digits: int = 1) -> str:
+    """Write a share in per cent."""
+    return f"{number(100 * share, digits)} %"
+
+
+def probability(value: float) -> str:
+    """Write a probability in per cent with one decimal, never rounded to certainty or to impossibility."""
+    if value > 0.9995:
+        return "more than 99.9 %"
+    if value < 0.0005:
+        return "less than 0.1 %"
+    return percent(value)
+
+
+def count(number_of: int, one: str, many: str | None = None) -> str:
+    """Write a count with its noun: ``count(1, "line")`` is "1 line", ``count(1200, "line")`` "1 200 lines"."""
+    noun = one if number_of == 1 else (many or f"{one}s")
+    return f"{number_of:,} {noun}".replace(",", _GROUP)
+
+
+def p_value(value: float) -> str:
+    """Write a p-value: three decimals, or "< 0.001"."""
+    if not math.isfinite(value):
+        return "unknown"
+    return "< 0.001" if value < 0.001 else f"{value:.3f}"

@@ -1,0 +1,104 @@
+"""The bench of a session: the devices that the settings name, opened, and closed on every way out."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncGenerator
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.settings import Settings
+from lab.world import virtual_world
+from projector.device import ProjectorDevice, open_projector
+from projector.render import render
+from projector.shape import Shape, check_fits
+from robot.bolt import Bolt
+from robot.device import RobotDevice
+from robot.profile import RobotProfile
+from tracking.cameras import Camera, open_camera
+from tracking.recorder import Recorder
+
+Picture = NDArray[np.uint8]
+SHAPE_MARGIN_CM = 4.0  # a ball's radius and a little: what lies nearer to the wall, the sensor never reaches
+
+
+@dataclass(frozen=True, slots=True)
+class Pictures:
+    """What a session projects: the shape, and the two pictures from which the light levels are learnt."""
+
+    shape: Picture
+    black: Picture
+    white: Picture
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """Open devices. ``recorder`` is None for a session without a camera.
+
+    ``cruising_cm_s`` is the speed that the robot will really be told: its command counts in whole units.
+    """
+
+    robot: RobotDevice
+    projector: ProjectorDevice
+    camera: Camera | None
+    recorder: Recorder | None
+    pictures: Pictures
+    cruising_cm_s: float
+
+    async def show(self, picture: Picture) -> None:
+        """Put a picture on the projector, and tell a virtual camera that its scene has changed."""
+        self.projector.show(picture)
+        changed = getattr(self.camera, "scene_changed", None)
+        if changed is not None:
+            changed()
+
+    def devices(self) -> dict[str, Any]:
+        """What the manifest keeps of the devices besides the robot's own identity."""
+        return {
+            "cruising_cm_s": self.cruising_cm_s,
+            "projector": {"image_size": list(self.projector.image_size)},
+            "camera": None
+            if self.camera is None
+            else {"name": self.camera.name, "size": list(self.camera.size), "rate_hz": self.camera.rate_hz},
+        }
+
+
+@asynccontextmanager
+async def open_bench(settings: Settings, shape: Shape, seed: np.random.SeedSequence) -> AsyncGenerator[Bench]:
+    """Open the bench for one shape.
+
+    Raises:
+        ShapeError: the shape does not fit the arena.
+        RenderError: the projector cannot show all of it.
+        ChordlabError: a device cannot be opened; the line says which and why.
+    """
+    check_fits(shape, settings.arena.polygon, SHAPE_MARGIN_CM)
+    optics = settings.projector_optics.pinhole()
+    profile = RobotProfile()
+    async with AsyncExitStack() as stack:
+        if settings.is_virtual:
+            world = await stack.enter_async_context(virtual_world(settings, seed, profile))
+            robot, projector, camera = world.robot, world.projector, world.camera
+        else:
+            robot = Bolt(settings.robot.removeprefix("ble:"), profile=profile)
+            projector = open_projector(settings.projector, image_size=optics.image_size)
+            camera = None if settings.camera == "none" else open_camera(settings.camera)
+        stack.callback(projector.close)
+        width_px, height_px = projector.image_size
+        pictures = Pictures(
+            shape=render(shape.geometry, optics, settings.sensor.height_cm),
+            black=np.zeros((height_px, width_px), dtype=np.uint8),
+            white=np.full((height_px, width_px), 255, dtype=np.uint8),
+        )
+        stack.push_async_callback(robot.disconnect)
+        recorder = None
+        if camera is not None:
+            recorder = Recorder(camera)
+            await recorder.start()
+            stack.push_async_callback(recorder.stop)
+            settings.camera_calibration().check_size(camera.size)
+        cruising_cm_s = profile.cm_s_per_unit * profile.speed_units(settings.motion.speed_cm_s)
+        yield Bench(robot, projector, camera, recorder, pictures, cruising_cm_s)

@@ -1,0 +1,61 @@
+"""`chordlab moments` and `chordlab simulate`: a shape's statistics, exact and by Monte Carlo."""
+
+from __future__ import annotations
+
+import time
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from analysis.montecarlo import simulate as simulate_runs
+from analysis.quadrature import exact_moments
+from lab.cli.output import JsonFlag, emit, progress_bar, say, show_table
+from lab.cli.shapes import FontOption, ShapeArgument
+from projector.dictionary import shape_from
+
+
+def moments(shape: ShapeArgument, font: FontOption = None, as_json: JsonFlag = False) -> None:
+    """Exact moments of a shape's random lines, by quadrature; sigmas are for one line, divide by √N.
+
+    Example: chordlab moments square
+    """
+    exact = exact_moments(shape_from(shape, font=font).geometry)
+    data = exact.to_dict()
+    if as_json:
+        emit(data)
+        return
+    show_table(shape, ("quantity", "value"), [(name, f"{value:.6g}") for name, value in data.items()])
+
+
+def simulate(
+    shape: ShapeArgument,
+    lines: Annotated[int, typer.Option(min=2, max=10_000_000, help="Crossing lines N in each run.")] = 1000,
+    runs: Annotated[int, typer.Option(min=1, max=1_000_000, help="Independent runs.")] = 1000,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random lines.")] = 1,
+    font: FontOption = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Monte Carlo: area and perimeter as RUNS robots would find them after LINES crossing lines each.
+
+    Example: chordlab simulate eiffel --lines 300 --runs 1000 --seed 1
+    """
+    drawn = shape_from(shape, font=font)
+    started_s = time.perf_counter()
+    with progress_bar("runs", quiet=as_json) as update:
+        result = simulate_runs(drawn.geometry, lines=lines, runs=runs, rng=np.random.default_rng(seed), progress=update)
+    elapsed_s = time.perf_counter() - started_s
+    rate = lines * runs / elapsed_s
+    if as_json:
+        emit({"area_cm2": result.area_cm2, "perimeter_cm": result.perimeter_cm, "lines_per_second": rate})
+        return
+    rows = [
+        ("area, cm²", drawn.area_cm2, result.area_cm2),
+        ("perimeter, cm", drawn.perimeter_cm, result.perimeter_cm),
+    ]
+    show_table(
+        f"{drawn.title}: {runs} runs of {lines} lines",
+        ("quantity", "true", "mean", "σ of a run"),
+        [(name, f"{true:.2f}", f"{found.mean():.2f}", f"{found.std():.2f}") for name, true, found in rows],
+    )
+    say(f"{rate:.3g} lines/s")

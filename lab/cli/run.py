@@ -1,0 +1,148 @@
+"""`chordlab run`: a full session, ending in a report."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Generator
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import psutil
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from lab.cli.output import JsonFlag, complain, emit, progress_bar, say
+from lab.experiment import Finished, run_experiment
+from lab.finalize import finalize
+from lab.review import review
+from lab.session import Progress as Step
+from lab.session import Watcher
+from lab.settings import Settings, load_settings
+from lab.store import write_checksums
+
+
+def run(
+    session: Annotated[Path | None, typer.Argument(metavar="[SESSION.toml]", help="Settings; none: defaults.")] = None,
+    simulate: Annotated[bool, typer.Option("--simulate", help="On the virtual bench, whatever the file says.")] = False,
+    shape: Annotated[str | None, typer.Option(help="A dictionary name, text:WORD, or a shape file.")] = None,
+    lines: Annotated[int | None, typer.Option(help="Stop after this many lines that cross the shape.")] = None,
+    until: Annotated[float | None, typer.Option(help="Stop once the leading posterior reaches this.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Everything random follows from it.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Where the session folder goes.")] = None,
+    no_video: Annotated[bool, typer.Option("--no-video", help="Without a camera.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Only the report's path, and errors.")] = False,
+    as_json: JsonFlag = False,
+) -> None:
+    """Run a full lab session and report on it; the report's path is printed last.
+
+    Example: chordlab run --simulate --shape eiffel --lines 150 --seed 1
+    """
+    settings = _settings(
+        session,
+        simulate,
+        no_video,
+        {"shape": shape, "stop.lines": lines, "stop.until": until, "seed": seed, "out": out},
+    )
+    hushed = quiet or as_json
+    began_s = time.perf_counter()
+    with _session_bar(settings, quiet=hushed) as watch:
+        finished = run_experiment(settings, started=datetime.now(), watch=watch, say=_hush if hushed else complain)
+    rolled_s = time.perf_counter() - began_s
+    tables = finalize(finished.folder)
+    if finished.failure is not None:
+        complain(f"chordlab: {finished.failure}")
+    if finished.interrupted:
+        complain(
+            f"interrupted after {len(tables.estimates)} crossing lines; read them: chordlab validate {finished.folder}"
+        )
+        raise typer.Exit(1)
+    ratios = _ratios(finished, settings, rolled_s)
+    with progress_bar("tracking the video", quiet=hushed) as update:
+        summary = review(finished.folder, report=True, host=ratios, progress=update)
+    write_checksums(finished.folder)
+    summary["seconds"] = time.perf_counter() - began_s
+    summary["peak_memory_mb"] = _peak_memory_mb()
+    if as_json:
+        emit({**summary, **ratios, "folder": finished.folder})
+    else:
+        if not quiet:
+            say(str(summary["verdict"]))
+            for name, value in ratios.items():
+                say(f"{name.replace('_', ' ')}: {value:.1f}")
+        say(str(summary["report"]))
+    if finished.failure is not None:
+        raise typer.Exit(1)
+
+
+def _hush(_text: str) -> None:
+    """Say nothing."""
+
+
+def _settings(session: Path | None, simulate: bool, no_video: bool, flags: dict[str, Any]) -> Settings:
+    overrides = {
+        key: str(value) if isinstance(value, Path) else value for key, value in flags.items() if value is not None
+    }
+    if simulate:
+        overrides |= {"robot": "virtual", "projector": "virtual", "camera": "virtual"}
+    if no_video:
+        overrides["camera"] = "none"
+    return load_settings(session, overrides)
+
+
+def _ratios(finished: Finished, settings: Settings, rolled_s: float) -> dict[str, float]:
+    """How much faster than the robot the virtual bench rolled; nothing of the kind on a real one."""
+    if not settings.is_virtual or finished.outcome is None:
+        return {}
+    kind = "without_video" if settings.camera == "none" else "with_video"
+    return {
+        "robot_seconds": finished.outcome.rolling_s,
+        "wall_seconds": rolled_s,
+        f"times_real_time_{kind}": finished.outcome.rolling_s / rolled_s,
+    }
+
+
+def _peak_memory_mb() -> float:
+    """Largest resident memory of this process so far, MB."""
+    info = psutil.Process().memory_info()
+    peak: int | None = getattr(info, "peak_wset", None)  # Windows
+    if peak is not None:
+        return peak / 1e6
+    import resource  # noqa: PLC0415 - not on Windows
+    import sys  # noqa: PLC0415 - for the unit alone
+
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+
+
+@contextmanager
+def _session_bar(settings: Settings, *, quiet: bool) -> Generator[Watcher]:
+    """Progress on stderr: lines, A ± , P ±, the leading name and its posterior, battery, time left."""
+    console = Console(stderr=True, quiet=quiet)
+    columns = (
+        TextColumn("line {task.completed}/{task.total}"),
+        BarColumn(bar_width=20),
+        TextColumn("{task.description}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, transient=True, disable=quiet or not console.is_terminal) as bar:
+        task = bar.add_task("setting out", total=settings.stop.lines)
+
+        def watch(step: Step) -> None:
+            text = "no line has crossed the shape yet"
+            if step.n:
+                text = (
+                    f"A {_with_error(step.area_cm2, step.sigma_area_cm2)} cm²  "
+                    f"P {_with_error(step.perimeter_cm, step.sigma_perimeter_cm)} cm  "
+                    f"{step.leading} {step.posterior:.2f}  battery {step.battery_v:.2f} V"
+                )
+            bar.update(task, completed=step.n, description=text)
+
+        yield watch
+
+
+def _with_error(value: float, sigma: float) -> str:
+    return f"{value:.0f} ± {sigma:.0f}" if math.isfinite(sigma) else f"{value:.0f}"

@@ -1,0 +1,151 @@
+"""One whole experiment: dictionary, bench, session, store. What `chordlab run` does before the review."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import platform
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from shapely.geometry import mapping
+
+from analysis.quadrature import Moments, exact_moments
+from analysis.recognition import Recogniser
+from lab.base.errors import ChordlabError
+from lab.bench import Bench, open_bench
+from lab.clock import run as run_on_clock
+from lab.recognisers import recogniser_for
+from lab.session import Outcome, Preflight, Session, Watcher
+from lab.settings import Settings
+from lab.store import SessionWriter, disk_faults
+from projector.dictionary import load_dictionary, shape_from
+from projector.shape import Shape
+
+_VERSIONED = ("chordlab", "numpy", "shapely", "opencv-python-headless", "bleak", "bumble", "filterpy", "numba", "av")
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """An experiment's folder and how it ended. ``interrupted`` is true after Ctrl-C, ``failure`` holds an error."""
+
+    folder: Path
+    outcome: Outcome | None
+    interrupted: bool
+    failure: ChordlabError | None
+
+
+@dataclass(slots=True)
+class _Kept:
+    """What must outlive an interrupt."""
+
+    writer: SessionWriter | None = None
+    outcome: Outcome | None = None
+
+
+def dictionary_with(shape: Shape) -> dict[str, Shape]:
+    """The dictionary, and the projected shape too where it is none of its entries."""
+    known = load_dictionary()
+    return known if shape.name in known else {**known, shape.name: shape}
+
+
+def moments_of(dictionary: dict[str, Shape]) -> dict[str, Moments]:
+    """Exact moments of every entry."""
+    return {name: exact_moments(entry.geometry) for name, entry in dictionary.items()}
+
+
+def run_experiment(
+    settings: Settings,
+    *,
+    started: datetime,
+    watch: Watcher | None = None,
+    say: Callable[[str], None] = lambda _: None,
+) -> Finished:
+    """Run one session on the bench that the settings name and leave its folder.
+
+    An interrupt or a failure after the folder was made is returned, not raised: the folder is readable.
+
+    Raises:
+        ChordlabError: nothing was recorded, since the request was wrong or the preflight failed.
+    """
+    shape = shape_from(settings.shape, font=settings.font)
+    world_seed, turn_seed, table_seed = np.random.SeedSequence(settings.seed).spawn(3)
+    dictionary = dictionary_with(shape)
+    say(f"dictionary: {len(dictionary)} entries; learning how each looks to a blind robot")
+    recogniser = recogniser_for(dictionary, settings, np.random.default_rng(table_seed))
+    kept = _Kept()
+
+    async def on_the_bench() -> None:
+        async with open_bench(settings, shape, world_seed) as bench:
+            session = Session(bench, settings, recogniser, np.random.default_rng(turn_seed), watch=watch)
+            preflight = await session.preflight()
+            say(
+                f"{preflight.identity.name}: firmware {preflight.identity.firmware}, "
+                f"battery {preflight.identity.battery_v:.2f} V; dark {preflight.levels.dark_lux:.0f} lux, "
+                f"lit {preflight.levels.bright_lux:.0f} lux"
+            )
+            manifest = _manifest(settings, shape, dictionary, bench, preflight, recogniser, started)
+            tag = hashlib.sha256(str(sorted(manifest.items())).encode()).hexdigest()[:4]
+            kept.writer = SessionWriter.create(settings.out, shape.name, manifest, started=started, tag=tag)
+            kept.outcome = await session.roll(kept.writer, preflight.levels)
+
+    interrupted, failure = False, None
+    with ExitStack() as stack:
+        stack.callback(lambda: kept.writer.close() if kept.writer else None)
+        stack.enter_context(disk_faults(settings.out))
+        try:
+            run_on_clock(on_the_bench(), virtual=settings.is_virtual)
+        except KeyboardInterrupt:
+            if kept.writer is None:
+                raise
+            interrupted = True
+        except ChordlabError as error:
+            if kept.writer is None:
+                raise
+            failure = error
+    if kept.writer is None:  # not reached: without a folder the block above raised
+        raise ChordlabError("the session left no folder; run chordlab doctor")
+    return Finished(kept.writer.folder, kept.outcome, interrupted, failure)
+
+
+def _manifest(
+    settings: Settings,
+    shape: Shape,
+    dictionary: dict[str, Shape],
+    bench: Bench,
+    preflight: Preflight,
+    recogniser: Recogniser,
+    started: datetime,
+) -> dict[str, Any]:
+    """Everything that one must know to analyse the session years later."""
+    font = shape.font
+    return {
+        "started": started.isoformat(timespec="seconds"),
+        "virtual": settings.is_virtual,
+        "settings": settings.model_dump(mode="json", exclude={"out"}),
+        "seed": settings.seed,
+        "shape": {
+            "name": shape.name,
+            "title": shape.title,
+            "digest": shape.digest,
+            "geometry": mapping(shape.geometry),
+            "font": None if font is None else {"name": font.name, "sha256": font.sha256},
+        },
+        "dictionary": {name: entry.digest for name, entry in sorted(dictionary.items())},
+        "recogniser": type(recogniser).__name__,
+        "levels": asdict(preflight.levels),
+        "devices": {"robot": asdict(preflight.identity), **bench.devices()},
+        "calibration": {
+            "camera": settings.camera_calibration().to_dict(),
+            "projector": settings.projector_optics.pinhole().to_dict(),
+        },
+        "versions": {
+            "python": platform.python_version(),
+            **{name: importlib.metadata.version(name) for name in _VERSIONED},
+        },
+    }

@@ -1,0 +1,315 @@
+"""A stored session, reviewed: its video tracked, its estimates held against ground truth, its report written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from shapely import Polygon
+from shapely.geometry import shape as shape_of
+
+from analysis.estimate import Estimate, estimate, relative_covariance
+from analysis.figures.values import Band, Entry, Isotropy, Measured
+from analysis.invariants import invariants_table
+from analysis.montecarlo import running_bands
+from analysis.quadrature import Moments
+from analysis.report.result import SessionResult
+from analysis.report.verdict import verdict_of
+from analysis.report.write import write_report
+from lab.base.errors import RequestError
+from lab.experiment import dictionary_with, moments_of
+from lab.finalize import Tables, finalize
+from lab.recognisers import recogniser_for
+from lab.settings import Settings, parse_settings
+from lab.store import REPORT, SessionReader
+from projector.shape import Shape, Silhouette
+from tracking.calibration import Calibration
+from tracking.isotropy import IsotropyReport, TooFewLinesError, examine_lines
+from tracking.linespace import LineSpace
+from tracking.runs import fit_lines
+from tracking.segment import frames_table
+from tracking.track import track_segments
+from tracking.truth import ChordMatch, match_crossings, true_crossings
+
+Progress = Callable[[int, int], None]
+
+SHORTEST_RUN_CM = 5.0  # a few frames: shorter runs cannot be told from turning on the spot
+_BAND_RUNS = 400
+_BAND_POINTS = 40
+
+
+@dataclass(frozen=True, slots=True)
+class Filmed:
+    """What the camera saw of a session."""
+
+    track: pd.DataFrame
+    lines: pd.DataFrame
+    crossings: pd.DataFrame
+    match: ChordMatch
+    estimate: Estimate | None
+    isotropy: IsotropyReport | None
+
+
+@dataclass(frozen=True, slots=True)
+class Reviewed:
+    """A session with everything that was found in it."""
+
+    session: SessionReader
+    settings: Settings
+    shape: Shape
+    tables: Tables
+    moments: dict[str, Moments]
+    titles: dict[str, str]
+    ranking: list[tuple[str, float]]
+    posteriors: pd.DataFrame
+    robot: Estimate | None
+    filmed: Filmed | None
+
+
+def stored_shape(session: SessionReader) -> Shape:
+    """The shape that was projected, from the session's own manifest."""
+    try:
+        stored = session.manifest["shape"]
+        geometry: Any = shape_of(stored["geometry"])
+        return Shape(stored["name"], stored["title"], geometry, "the session's manifest")
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise RequestError(f"{session.folder}: the manifest's shape is not whole ({error!r})") from error
+
+
+def stored_settings(session: SessionReader) -> Settings:
+    """The settings that a session ran with."""
+    return parse_settings(session.manifest.get("settings", {}), origin=f"{session.folder}: manifest settings")
+
+
+def examine(folder: Path, *, workers: int = 2, progress: Progress | None = None) -> Reviewed:
+    """Read a session, track its video where there is one, and compare robot, camera and truth."""
+    session = SessionReader(folder)
+    settings, shape = stored_settings(session), stored_shape(session)
+    rng = np.random.default_rng(settings.seed)
+    tables = finalize(folder)
+    dictionary = dictionary_with(shape)
+    ranking, posteriors = recognised(session, tables)
+    return Reviewed(
+        session=session,
+        settings=settings,
+        shape=shape,
+        tables=tables,
+        moments=moments_of(dictionary),
+        titles={name: entry.title for name, entry in dictionary.items()},
+        ranking=ranking,
+        posteriors=posteriors,
+        robot=_estimate(_counted(tables)),
+        filmed=_filmed(session, settings, shape.geometry, tables, rng, workers, progress),
+    )
+
+
+def recognised(session: SessionReader, tables: Tables) -> tuple[list[tuple[str, float]], pd.DataFrame]:
+    """The final ranking, and ``n`` with one column for each entry: the posterior after each crossing line."""
+    settings = stored_settings(session)
+    dictionary = dictionary_with(stored_shape(session))
+    recogniser = recogniser_for(dictionary, settings, np.random.default_rng(settings.seed))
+    rows: list[dict[str, float]] = []
+    for n, (k, l1_cm, l3_cm3) in enumerate(_counted(tables)[["k", "l1_cm", "l3_cm3"]].to_numpy(), start=1):
+        recogniser.update(int(k), l1_cm, l3_cm3)
+        rows.append({"n": n, **recogniser.posterior()})
+    return recogniser.ranked(), pd.DataFrame(rows, columns=["n", *recogniser.names])
+
+
+def _counted(tables: Tables) -> pd.DataFrame:
+    """The lines of the statistics that crossed the shape."""
+    lines = tables.lines
+    return lines[lines["counts"] & (lines["k"] > 0)]
+
+
+def _estimate(lines: pd.DataFrame) -> Estimate | None:
+    return estimate(lines["k"], lines["l1_cm"], lines["l3_cm3"]) if len(lines) > 1 else None
+
+
+def _filmed(
+    session: SessionReader,
+    settings: Settings,
+    geometry: Silhouette,
+    tables: Tables,
+    rng: np.random.Generator,
+    workers: int,
+    progress: Progress | None,
+) -> Filmed | None:
+    segments = session.segments()
+    if not segments:
+        return None
+    calibration = Calibration.from_dict(session.manifest["calibration"]["camera"])
+    track = track_segments(segments, calibration, workers=workers, progress=progress)
+    track = _on_host_clock(track, segments)
+    track.to_parquet(session.folder / "track.parquet", index=False)
+    counts = tables.lines.loc[tables.lines["counts"], "line"]
+    lines = fit_lines(track)
+    lines = lines[lines["line"].isin(counts) & (lines["reason"] == "")].reset_index(drop=True)
+    crossings = true_crossings(lines, geometry, track=track)
+    invariants = invariants_table(crossings)
+    try:
+        isotropy = examine_lines(
+            lines["theta_rad"],
+            lines["p_cm"],
+            lines["length_cm"],
+            settings.arena.reachable,
+            rng,
+            shortest_cm=SHORTEST_RUN_CM,
+        )
+    except TooFewLinesError:
+        isotropy = None
+    return Filmed(
+        track,
+        lines,
+        crossings,
+        match_crossings(tables.crossings, crossings, lines=lines["line"]),
+        _estimate(invariants),
+        isotropy,
+    )
+
+
+def _on_host_clock(track: pd.DataFrame, segments: Mapping[int, Path]) -> pd.DataFrame:
+    """Move each segment's times from the camera's clock to the host's, which stamped the robot's crossings."""
+    shift_s: dict[int, float] = {}
+    for line, video in segments.items():
+        stamps = pd.read_parquet(frames_table(video))
+        shift_s[line] = float((stamps["t_host_s"] - stamps["t_camera_s"]).median()) if len(stamps) else 0.0
+    return track.assign(t_s=track["t_s"] + track["line"].map(shift_s))
+
+
+def summarise(found: Reviewed, result: SessionResult) -> dict[str, Any]:
+    """The figures of a review: robot, camera and truth, chords, isotropy, homogeneity, verdict."""
+    filmed = found.filmed
+    match, isotropy = (filmed.match, filmed.isotropy) if filmed else (None, None)
+    return {
+        "folder": found.session.folder,
+        "shape": found.shape.name,
+        "lines": len(_counted(found.tables)),
+        "runs": len(found.tables.lines),
+        "robot": _figures(found.robot),
+        "camera": _figures(filmed.estimate if filmed else None),
+        "truth": {"area_cm2": found.shape.area_cm2, "perimeter_cm": found.shape.perimeter_cm},
+        "recognised": {"name": found.ranking[0][0], "posterior": found.ranking[0][1]},
+        "chords": None if match is None else match.to_dict(),
+        "isotropy": None if isotropy is None else {"p_value": isotropy.isotropy_p, "bias": isotropy.bias},
+        "homogeneity": None if isotropy is None else {"p_value": isotropy.homogeneity_p},
+        "verdict": verdict_of(result).headline,
+    }
+
+
+def _figures(found: Estimate | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    return {
+        "area_cm2": found.area_cm2,
+        "perimeter_cm": found.perimeter_cm,
+        "sigma_area_cm2": found.sigma_area_cm2,
+        "sigma_perimeter_cm": found.sigma_perimeter_cm,
+        "correlation": found.correlation,
+        "lines": found.n,
+    }
+
+
+def to_result(found: Reviewed, host: Mapping[str, Any] | None = None) -> SessionResult:
+    """Everything that the report shows, as plain data."""
+    filmed, manifest = found.filmed, found.session.manifest
+    name = found.shape.name
+    counted = _counted(found.tables)
+    return SessionResult(
+        name=name,
+        title=found.shape.title,
+        geometry=found.shape.geometry,
+        arena=found.settings.arena.polygon,
+        lines=found.tables.lines[found.tables.lines["counts"]],
+        crossings=found.tables.crossings,
+        estimates=found.tables.estimates,
+        exact=_entry(found.titles[name], found.moments[name]),
+        dictionary={key: _entry(found.titles[key], moments) for key, moments in found.moments.items()},
+        ranking=found.ranking,
+        stop_at=found.settings.stop.until or 0.95,
+        posteriors=found.posteriors,
+        band=_band(found.shape.geometry, len(counted), found.settings.seed),
+        track=filmed.track if filmed else None,
+        true_lines=filmed.lines if filmed else None,
+        true_crossings=filmed.crossings if filmed else None,
+        camera=_measured(filmed.estimate) if filmed else None,
+        chord_pairs=filmed.match.pairs if filmed else None,
+        chords_missed=filmed.match.missed if filmed else None,
+        chords_extra=filmed.match.extra if filmed else None,
+        isotropy=_isotropy(filmed, found.settings.arena.reachable) if filmed else None,
+        session=found.session.folder.name,
+        provenance={
+            "session": {
+                "started": manifest.get("started"),
+                "seed": manifest.get("seed"),
+                "bench": "virtual" if manifest.get("virtual") else "real",
+                "end": manifest.get("end", {}).get("state", "was cut short"),
+                **(host or {}),
+            },
+            "devices": manifest.get("devices", {}),
+            "shape": {"digest": manifest["shape"].get("digest"), "font": manifest["shape"].get("font")},
+            "settings": manifest.get("settings", {}),
+            "versions": manifest.get("versions", {}),
+        },
+        warnings=_warnings(found),
+    )
+
+
+def _entry(title: str, moments: Moments) -> Entry:
+    size = np.array([moments.area_cm2, moments.perimeter_cm])
+    relative = relative_covariance(moments.mean, moments.covariance)
+    return Entry(title, moments.area_cm2, moments.perimeter_cm, relative * np.outer(size, size))
+
+
+def _measured(found: Estimate | None) -> Measured | None:
+    return None if found is None else Measured(found.n, found.area_cm2, found.perimeter_cm, found.covariance)
+
+
+def _band(geometry: Silhouette, lines: int, seed: int) -> Band | None:
+    if lines < 2:
+        return None
+    checkpoints = np.unique(np.geomspace(2, lines, _BAND_POINTS).round().astype(np.int64))
+    bands = running_bands(geometry, checkpoints, _BAND_RUNS, np.random.default_rng(seed))
+    return Band(bands.n, bands.quantile_levels, bands.area_quantiles_cm2, bands.perimeter_quantiles_cm, _BAND_RUNS)
+
+
+def _isotropy(filmed: Filmed, reachable: Polygon) -> Isotropy | None:
+    found = filmed.isotropy
+    if found is None:
+        return None
+    u, v = LineSpace.of(reachable).uniforms(filmed.lines["theta_rad"], filmed.lines["p_cm"])
+    p_values = {test.name.replace("_", " "): test.holm_p_value for test in found.tests}
+    return Isotropy(u, v, p_values | {"run length": found.run_length_p}, found.passed, found.verdict)
+
+
+def _warnings(found: Reviewed) -> list[str]:
+    lines = found.tables.lines
+    said: list[str] = []
+    state = found.session.manifest.get("end", {}).get("state", "cut short")
+    if state not in ("complete", "recognised"):
+        said.append(f"The session ended early ({state}); what was recorded until then is whole.")
+    given_up = int(lines["ended"].isin(["timeout", "stall"]).sum())
+    if given_up > 0.02 * len(lines):
+        said.append(f"{given_up} of {len(lines)} runs reached no wall and are left out: was the robot stuck or lifted?")
+    if found.filmed is not None:
+        unseen = int(lines["counts"].sum()) - len(found.filmed.lines)
+        if unseen > 0.05 * len(lines):
+            said.append(f"The camera could not follow {unseen} of {int(lines['counts'].sum())} runs.")
+    return said
+
+
+def review(
+    folder: Path,
+    *,
+    report: bool,
+    host: Mapping[str, Any] | None = None,
+    workers: int = 2,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Examine a session, write its report when asked, and give its figures (``report``: its path, or None)."""
+    found = examine(folder, workers=workers, progress=progress)
+    result = to_result(found, host)
+    return {**summarise(found, result), "report": write_report(result, folder / REPORT) if report else None}

@@ -1,0 +1,263 @@
+"""The settings of a session: a TOML file, checked here, with the defaults of the virtual bench.
+
+Every field is documented, unknown keys are refused. What is written into the manifest is the whole
+of it, so that a session says how it was made.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from shapely import Point, Polygon, box
+
+from lab.base.errors import RequestError
+from lab.base.pinhole import Pinhole
+from tracking.calibration import Calibration, load_calibration
+
+BALL_RADIUS_CM = 3.65  # a Sphero BOLT is 73 mm across
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+
+class ArenaSettings(_Section):
+    """The walled floor that the robot rolls on, centred at the origin."""
+
+    kind: Literal["rectangle", "disc"] = "rectangle"
+    """`rectangle` (width_cm by height_cm) or `disc` (radius_cm)."""
+    width_cm: Positive = 120.0
+    """Inner width between the walls, of a rectangle."""
+    height_cm: Positive = 90.0
+    """Inner height between the walls, of a rectangle."""
+    radius_cm: Positive = 60.0
+    """Inner radius of the wall, of a disc."""
+
+    @property
+    def polygon(self) -> Polygon:
+        """The floor between the walls, cm."""
+        if self.kind == "disc":
+            return Point(0, 0).buffer(self.radius_cm, quad_segs=90)
+        return box(-self.width_cm / 2, -self.height_cm / 2, self.width_cm / 2, self.height_cm / 2)
+
+    @property
+    def reachable(self) -> Polygon:
+        """Where the ball's centre can be: a ball's radius inside the walls, cm."""
+        inner = self.polygon.buffer(-BALL_RADIUS_CM, join_style="mitre")
+        if inner.is_empty:
+            raise RequestError(f"the arena is too small for a ball of {2 * BALL_RADIUS_CM:g} cm; widen [arena]")
+        return inner
+
+
+class MotionSettings(_Section):
+    """How the robot rolls and turns."""
+
+    speed_cm_s: Annotated[float, Field(gt=0, le=150)] = 25.0
+    """Cruising speed. The paper rolls at 1 cm/s; at most 150 cm/s."""
+    turning: Literal["lambert", "uniform"] = "lambert"
+    """How it turns at the wall: `lambert` (cosine law: isotropic uniform lines) or `uniform` (biased, to show it)."""
+    run_timeout_s: Positive = 60.0
+    """A run without a bump for this long is given up: the robot is stuck or lifted."""
+    length_from: Literal["time", "odometry"] = "time"
+    """What chord lengths come from: elapsed time × speed, as in the paper, or the wheels. Both are recorded."""
+
+
+class SensorSettings(_Section):
+    """The light sensor and its stream."""
+
+    interval_s: Annotated[float, Field(ge=0.025, le=1)] = 0.05
+    """Time between two light samples. Below 25 ms the radio link breaks."""
+    height_cm: Positive = 6.0
+    """Height of the light sensor above the floor: the plane for which shapes are projected."""
+
+
+class LedSettings(_Section):
+    """The light on the robot that the camera follows."""
+
+    dark_level: Fraction = 0.25
+    """Brightness outside the shape. 0 blinks fully dark, as in the paper."""
+    lit_level: Fraction = 1.0
+    """Brightness inside the shape."""
+    height_cm: Positive = 7.3
+    """Height of the LED above the floor."""
+
+
+class OpticsSettings(_Section):
+    """Where a camera or projector hangs: a calibration file, or a pose measured by hand."""
+
+    calibration: Path | None = None
+    """A calibration.json; the other fields are then not used."""
+    image_size: tuple[Annotated[int, Field(ge=16, le=16384)], Annotated[int, Field(ge=16, le=16384)]] = (1280, 720)
+    """Width and height of the picture in pixels."""
+    height_cm: Positive = 205.0
+    """Height of the optical centre above the floor."""
+    field_width_cm: Positive = 175.0
+    """Width of the floor that the picture covers."""
+    centre_cm: tuple[float, float] = (0.0, 0.0)
+    """The floor point under the optical centre."""
+    tilt_deg: tuple[float, float] = (0.0, 0.0)
+    """Tilt away from the plumb line about the arena's x and y axes."""
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """Lens distortion k1, k2, p1, p2, k3 (OpenCV's order)."""
+
+    def pinhole(self) -> Pinhole:
+        """The optics. Raises RequestError for a calibration file that cannot be read."""
+        if self.calibration is not None:
+            return load_calibration(self.calibration).optics
+        tilt_x, tilt_y = self.tilt_deg
+        return Pinhole.looking_down(
+            self.image_size,
+            height_cm=self.height_cm,
+            field_width_cm=self.field_width_cm,
+            centre_cm=self.centre_cm,
+            tilt_rad=(math.radians(tilt_x), math.radians(tilt_y)),
+            distortion=self.distortion,
+        )
+
+
+def _camera_optics() -> OpticsSettings:
+    return OpticsSettings(tilt_deg=(1.0, -1.5), distortion=(-0.12, 0.03, 0.0, 0.0, 0.0))
+
+
+def _projector_optics() -> OpticsSettings:
+    return OpticsSettings(image_size=(1920, 1080), height_cm=250.0, field_width_cm=200.0)
+
+
+class StopSettings(_Section):
+    """When a session ends."""
+
+    lines: Annotated[int, Field(ge=1, le=10_000_000)] = 150
+    """Number N of lines that cross the shape, at most."""
+    until: Annotated[float, Field(gt=0.5, lt=1)] | None = None
+    """Stop early once the leading name's posterior reaches this; none: go on to `lines`."""
+    at_least: Annotated[int, Field(ge=1)] = 50
+    """Never stop on the posterior before this many crossing lines."""
+
+
+class VirtualSettings(_Section):
+    """The physical world of the virtual bench: what the devices do not know."""
+
+    speed_error_sigma: Fraction = 0.02
+    """Relative error of each run's speed, one standard deviation."""
+    heading_drift_rad_per_cm: Annotated[float, Field(ge=0, le=0.1)] = 0.0002
+    """Curvature of a run, one standard deviation."""
+    footprint_cm: Annotated[float, Field(ge=0, le=5)] = 0.5
+    """Radius of the floor patch that the light sensor averages over."""
+    light_noise_lux: Annotated[float, Field(ge=0)] = 1.0
+    """Noise of one light sample, one standard deviation."""
+    ambient_lux: Annotated[float, Field(ge=0)] = 15.0
+    """Room light."""
+    black_lux: Annotated[float, Field(ge=0)] = 5.0
+    """What the projector throws where its picture is black."""
+    white_lux: Positive = 105.0
+    """What the projector throws where its picture is white."""
+    blur_px: Annotated[float, Field(ge=0, le=50)] = 1.0
+    """Defocus of the projector, one standard deviation in its own pixels."""
+    camera_noise: Annotated[float, Field(ge=0, le=50)] = 2.0
+    """Noise of the camera in grey levels, one standard deviation."""
+    camera_rate_hz: Annotated[float, Field(ge=1, le=240)] = 30.0
+    """Frames a second."""
+    camera_drop_probability: Fraction = 0.002
+    """Chance that a frame is lost."""
+
+
+class Settings(_Section):
+    """One session: what is projected, who rolls and watches, and when it ends."""
+
+    shape: str = "eiffel"
+    """A dictionary name, `text:WORD`, or a .geojson, .svg or .png file."""
+    seed: Annotated[int, Field(ge=0)] = 1
+    """Everything random follows from it."""
+    robot: str = "virtual"
+    """`ble:SB-1234` or `virtual`."""
+    camera: str = "virtual"
+    """`usb:0`, `file:video.mkv`, `virtual`, or `none`."""
+    projector: str = "virtual"
+    """`display:1`, `image:DIR`, or `virtual`."""
+    out: Path = Path("sessions")
+    """Where session folders go."""
+    font: Path | None = None
+    """Font file for text shapes; none: the first of the system's Helvetica-like fonts."""
+    stop: StopSettings = StopSettings()
+    arena: ArenaSettings = ArenaSettings()
+    motion: MotionSettings = MotionSettings()
+    sensor: SensorSettings = SensorSettings()
+    led: LedSettings = LedSettings()
+    camera_optics: OpticsSettings = Field(default_factory=_camera_optics)
+    """Where the camera hangs."""
+    projector_optics: OpticsSettings = Field(default_factory=_projector_optics)
+    """Where the projector hangs."""
+    virtual: VirtualSettings = VirtualSettings()
+
+    @model_validator(mode="after")
+    def _devices_are_known(self) -> Self:
+        _device("robot", self.robot, {"virtual": False, "ble": True})
+        _device("camera", self.camera, {"virtual": False, "none": False, "usb": True, "file": True})
+        _device("projector", self.projector, {"virtual": False, "display": True, "image": True})
+        if (self.robot == "virtual") != (self.projector == "virtual"):
+            raise ValueError("a virtual robot sees only the virtual projector: make both virtual, or neither")
+        if self.camera == "virtual" and self.robot != "virtual":
+            raise ValueError("a virtual camera sees only the virtual robot: set camera to usb:N, file:PATH or none")
+        return self
+
+    @property
+    def is_virtual(self) -> bool:
+        """Whether the session runs on the virtual bench, at virtual time."""
+        return self.robot == "virtual"
+
+    def camera_calibration(self) -> Calibration:
+        """The camera's optics with the height of the LED that it follows."""
+        return Calibration(optics=self.camera_optics.pinhole(), led_height_cm=self.led.height_cm)
+
+
+def _device(role: str, spec: str, kinds: dict[str, bool]) -> None:
+    """Check that a device string is one of ``kinds`` (kind → whether it takes an address)."""
+    kind, colon, address = spec.partition(":")
+    takes_address = kinds.get(kind)
+    if takes_address is None or takes_address != bool(colon and address):
+        forms = ", ".join(f"{name}:…" if takes else name for name, takes in kinds.items())
+        raise ValueError(f"{role} = {spec!r} is no device; use one of {forms}")
+
+
+def load_settings(path: Path | None, overrides: dict[str, Any] | None = None) -> Settings:
+    """Read a session's TOML (none: the defaults) and lay ``overrides`` (dotted keys) over it.
+
+    Raises:
+        RequestError: the file cannot be read or a key is unknown or out of range; the line names it.
+    """
+    data: dict[str, Any] = {}
+    if path is not None:
+        try:
+            data = tomllib.loads(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise RequestError(f"{path}: {error.strerror or 'cannot be read'}; check the path") from error
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise RequestError(f"{path} is not TOML: {error}") from error
+    for dotted, value in (overrides or {}).items():
+        section = data
+        *parents, key = dotted.split(".")
+        for parent in parents:
+            section = section.setdefault(parent, {})
+        section[key] = value
+    return parse_settings(data, origin=str(path) if path else "settings")
+
+
+def parse_settings(data: dict[str, Any], *, origin: str) -> Settings:
+    """Check settings that came as plain data. Raises RequestError with one line for the first fault."""
+    try:
+        return Settings.model_validate(data)
+    except ValidationError as error:
+        fault = error.errors()[0]
+        where = ".".join(str(part) for part in fault["loc"])
+        reason = fault["msg"].removeprefix("Value error, ")
+        if fault["type"] == "extra_forbidden":
+            reason = "is not a setting; see docs for the list, or take it out"
+        message = f"{origin}: {where + ' ' if where else ''}{reason}"
+        raise RequestError(message) from error

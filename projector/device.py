@@ -1,0 +1,78 @@
+"""What every projector can do, and how a device string becomes one."""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lab.base.errors import ChordlabError, RequestError
+
+
+class ProjectorError(ChordlabError):
+    """The projector failed while it ran: its window cannot be opened or was closed, its file not written."""
+
+
+class ProjectorRequestError(RequestError):
+    """A projector or an image was asked for that cannot be had. ``device`` is the string that was given."""
+
+    def __init__(self, device: str, problem: str) -> None:
+        self.device = device
+        super().__init__(f"projector {device}: {problem}")
+
+
+@runtime_checkable
+class ProjectorDevice(Protocol):
+    """A projector: it shows one gray image until it is shown the next.
+
+    ``show`` takes uint8 (height, width) in the projector's own pixels, row 0 at the top, and returns
+    when the image is on its way to the light. ``close`` may be called twice.
+    """
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(width, height) in pixels."""
+        ...
+
+    def show(self, image: NDArray[np.uint8]) -> None:
+        """Show ``image``; raises ProjectorRequestError for another size or type."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the device."""
+        ...
+
+
+def check_image(image: NDArray[np.uint8], image_size: tuple[int, int], device: str) -> None:
+    """Raise ProjectorRequestError unless ``image`` is uint8 gray of ``image_size`` (width, height)."""
+    width, height = image_size
+    if image.dtype != np.uint8 or image.shape != (height, width):
+        raise ProjectorRequestError(
+            device,
+            f"shows gray uint8 images of {width} x {height} pixels, got {image.dtype} of shape {image.shape};"
+            " render for this projector's image size",
+        )
+
+
+def open_projector(device: str, *, image_size: tuple[int, int] = (1920, 1080)) -> ProjectorDevice:
+    """Open ``display:N`` (full screen on display N, 0 is the main one) or ``image:DIR`` (numbered PNGs).
+
+    ``image_size`` is for ``image:DIR``; a display has its own. The virtual projector is no device of
+    this room alone: the lab composes it with the world. Raises ProjectorRequestError for any other
+    string and ProjectorError when the display cannot be opened.
+    """
+    kind, _, rest = device.partition(":")
+    if kind == "display":
+        if not rest.isdecimal():
+            raise ProjectorRequestError(device, "needs the display's number, for example display:1")
+        from projector.window import Window  # noqa: PLC0415 - pygame is an optional extra
+
+        return Window(int(rest))
+    if kind == "image":
+        if not rest:
+            raise ProjectorRequestError(device, "needs a folder, for example image:out/images")
+        from projector.images import ImageFolder  # noqa: PLC0415 - beside its sibling
+
+        return ImageFolder(rest, image_size=image_size)
+    raise ProjectorRequestError(device, "is not a projector; use display:N or image:DIR")

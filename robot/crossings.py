@@ -1,0 +1,237 @@
+"""Light to crossings: where along a run the shape's boundary was passed, from samples of the ambient light.
+
+The sensor sees a disc of floor, so at the boundary the light ramps over the width of that footprint. A
+straight boundary stands where half of the footprint is lit, at the level midway between dark and light,
+whatever the angle at which it is met. Two further levels on either side of the middle decide *whether* the
+boundary was passed (hysteresis), the middle alone decides *where*.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lab.base.errors import ChordlabError
+
+LOW_FRACTION = 0.35
+HIGH_FRACTION = 0.65
+# The thresholds lie 30 % of the span apart. Ten noise widths of span make that three, and leave 6.5 between
+# either level and the threshold beyond the middle: a false crossing once in ~10^10 samples.
+SEPARATION_NOISES = 10.0
+NOISE_FLOOR_LUX = 0.5  # a quiet or coarsely quantised sensor repeats itself; its noise is not then nil
+FEWEST_SAMPLES = 5
+_MAD_TO_SIGMA = 1.4826  # of a normal distribution
+
+
+@dataclass(frozen=True, slots=True)
+class Levels:
+    """The light in the dark and in the shape, and the thresholds between them, in lux.
+
+    ``low_lux`` confirms the dark and ``high_lux`` the light; the crossing is placed at ``mid_lux``.
+    """
+
+    dark_lux: float
+    bright_lux: float
+    low_lux: float
+    mid_lux: float
+    high_lux: float
+
+    def __post_init__(self) -> None:
+        if not self.dark_lux < self.low_lux < self.mid_lux < self.high_lux < self.bright_lux:
+            raise LevelsError(
+                "light levels must rise from dark over low, middle and high to bright: learn them anew",
+                dark_lux=self.dark_lux,
+                bright_lux=self.bright_lux,
+                noise_lux=math.nan,
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Crossing:
+    """A passage of the shape's boundary at ``s_cm`` along the run, into the light if ``entering``."""
+
+    t_s: float
+    s_cm: float
+    entering: bool
+
+
+class LevelsError(ChordlabError):
+    """Dark and light cannot be told apart, or were not seen. Cure: a darker room or a brighter projector.
+
+    Attributes:
+        dark_lux: Median of the samples taken in the dark; NaN if there were too few.
+        bright_lux: Median of those taken in the light; NaN if there were too few.
+        noise_lux: The larger of the two noise widths (one sigma); NaN if there were too few samples.
+    """
+
+    def __init__(self, message: str, *, dark_lux: float, bright_lux: float, noise_lux: float) -> None:
+        super().__init__(message)
+        self.dark_lux = dark_lux
+        self.bright_lux = bright_lux
+        self.noise_lux = noise_lux
+
+
+def _level_and_noise(lux: NDArray[np.float64]) -> tuple[float, float]:
+    """Median and MAD (as a sigma): up to half of the samples may be strays from the other side."""
+    if len(lux) < FEWEST_SAMPLES:
+        return math.nan, math.nan
+    level = float(np.median(lux))
+    return level, max(_MAD_TO_SIGMA * float(np.median(np.abs(lux - level))), NOISE_FLOOR_LUX)
+
+
+def learn_levels(dark_lux: ArrayLike, bright_lux: ArrayLike, *, separation: float = SEPARATION_NOISES) -> Levels:
+    """Learn the two levels and set the thresholds at 35, 50 and 65 % of the way from dark to light.
+
+    Args:
+        dark_lux: (n,) samples taken outside the shape; non-finite ones are left out.
+        bright_lux: (m,) samples taken inside it.
+        separation: Noise widths (the larger sigma of the two, at least 0.5 lux) that must lie between them.
+
+    Raises:
+        LevelsError: Fewer than five samples of either, or levels closer than ``separation`` noise widths.
+    """
+    dark = np.asarray(dark_lux, dtype=float).ravel()
+    bright = np.asarray(bright_lux, dtype=float).ravel()
+    dark, bright = dark[np.isfinite(dark)], bright[np.isfinite(bright)]
+    low_level, low_noise = _level_and_noise(dark)
+    high_level, high_noise = _level_and_noise(bright)
+    noise = max(low_noise, high_noise) if math.isfinite(low_noise) and math.isfinite(high_noise) else math.nan
+    seen = {"dark_lux": low_level, "bright_lux": high_level, "noise_lux": noise}
+    if math.isnan(noise):
+        raise LevelsError(
+            f"{len(dark)} samples of the dark and {len(bright)} of the light, and {FEWEST_SAMPLES} of each are "
+            "needed: hold the robot longer on each side, and check that its light stream runs",
+            **seen,
+        )
+    span = high_level - low_level
+    if span < separation * noise:
+        cure = (
+            "the two look swapped: put the robot outside the shape for the dark, inside for the light"
+            if -span >= separation * noise
+            else "darken the room, brighten the projector or dim the robot's own LEDs"
+        )
+        raise LevelsError(
+            f"dark ({low_level:.1f} lux) and light ({high_level:.1f} lux) lie {span / noise:.1f} noise widths of "
+            f"{noise:.1f} lux apart, and {separation:g} are needed: {cure}",
+            **seen,
+        )
+    return Levels(
+        dark_lux=low_level,
+        bright_lux=high_level,
+        low_lux=low_level + LOW_FRACTION * span,
+        mid_lux=low_level + 0.5 * span,
+        high_lux=low_level + HIGH_FRACTION * span,
+    )
+
+
+class CrossingDetector:
+    """Crossings of one run after another, sample by sample, in constant memory.
+
+    A crossing is reported once the light reaches the far threshold, and is placed where it passed the middle,
+    linearly between the two samples on either side. On a ramp that noise makes pass the middle several times
+    between the thresholds, it is placed at the mean of those passages: the first alone would come early, the
+    last late. A wiggle that never reaches the far threshold leaves nothing.
+
+    The crossings of a run alternate and begin with an entry: a run that starts in the light has one at its
+    start (returned by ``start``) and a run that ends there has an exit at its end (by ``finish``). What is
+    measured is the part of the shape that the robot can reach.
+
+    Samples whose light is not finite are passed over. ``s_cm`` must not decrease within a run.
+    """
+
+    __slots__ = ("_last", "_levels", "_lit", "_passages", "_sum_s_cm", "_sum_t_s")
+
+    def __init__(self, levels: Levels) -> None:
+        self._levels = levels
+        self._lit = False
+        self._last: tuple[float, float, float] | None = None
+        self._forget_passages()
+
+    @property
+    def lit(self) -> bool:
+        """Whether the robot is in the light, as far as confirmed."""
+        return self._lit
+
+    def _forget_passages(self) -> None:
+        self._passages = 0
+        self._sum_t_s = 0.0
+        self._sum_s_cm = 0.0
+
+    def start(self, t_s: float, s_cm: float, light_lux: float) -> Crossing | None:
+        """Begin a run at a sample, whose side of the middle level says whether it starts in the light.
+
+        Returns:
+            An entry at this very sample if it lies in the light, None in the dark.
+        """
+        self._forget_passages()
+        self._lit = False
+        self._last = None
+        if not math.isfinite(light_lux):
+            return None  # the first sample that can be read will begin the run
+        self._last = (t_s, s_cm, light_lux)
+        self._lit = light_lux >= self._levels.mid_lux
+        return Crossing(t_s, s_cm, entering=True) if self._lit else None
+
+    def feed(self, t_s: float, s_cm: float, light_lux: float) -> Crossing | None:
+        """Take the next sample of the run; the first one of all counts as ``start``.
+
+        Returns:
+            The crossing that this sample confirms, if any; it lies before the sample.
+        """
+        if self._last is None:
+            return self.start(t_s, s_cm, light_lux)
+        if not math.isfinite(light_lux):
+            return None
+        levels = self._levels
+        last_t_s, last_s_cm, last_lux = self._last
+        self._last = (t_s, s_cm, light_lux)
+        if (last_lux >= levels.mid_lux) != (light_lux >= levels.mid_lux):
+            part = (levels.mid_lux - last_lux) / (light_lux - last_lux)
+            self._passages += 1
+            self._sum_t_s += last_t_s + part * (t_s - last_t_s)
+            self._sum_s_cm += last_s_cm + part * (s_cm - last_s_cm)
+        confirmed = light_lux <= levels.low_lux if self._lit else light_lux >= levels.high_lux
+        refuted = light_lux >= levels.high_lux if self._lit else light_lux <= levels.low_lux
+        if confirmed:
+            self._lit = not self._lit
+            crossing = Crossing(self._sum_t_s / self._passages, self._sum_s_cm / self._passages, self._lit)
+            self._forget_passages()
+            return crossing
+        if refuted:  # back where it came from: the ramp, if it was one, begins anew
+            self._forget_passages()
+        return None
+
+    def finish(self, t_s: float, s_cm: float) -> Crossing | None:
+        """End the run.
+
+        Returns:
+            An exit at the end if the run ended in the light, None in the dark.
+        """
+        was_lit = self._lit
+        self._lit = False
+        self._last = None
+        self._forget_passages()
+        return Crossing(t_s, s_cm, entering=False) if was_lit else None
+
+
+def crossings_of(t_s: ArrayLike, s_cm: ArrayLike, light_lux: ArrayLike, levels: Levels) -> list[Crossing]:
+    """Crossings of one stored run, by the same detector; entries and exits pair up.
+
+    Args:
+        t_s: (n,) sample times in s.
+        s_cm: (n,) path rolled at each.
+        light_lux: (n,) light at each; NaN where it was lost.
+        levels: The session's levels.
+    """
+    times: Sequence[float] = np.asarray(t_s, dtype=float).tolist()
+    paths: Sequence[float] = np.asarray(s_cm, dtype=float).tolist()
+    lights: Sequence[float] = np.asarray(light_lux, dtype=float).tolist()
+    detector = CrossingDetector(levels)
+    found = [detector.feed(*sample) for sample in zip(times, paths, lights, strict=True)]
+    if times:
+        found.append(detector.finish(times[-1], paths[-1]))
+    return [crossing for crossing in found if crossing is not None]

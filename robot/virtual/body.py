@@ -1,0 +1,344 @@
+"""The body of the virtual robot: a ball that rolls in an arena, runs into its walls and sees the light below it.
+
+It moves only when it is asked how far it has come (``advance``), in closed form between the instants at
+which something changes, so where it is does not depend on how often it is asked.
+
+Angles: ``facing_rad`` is counter-clockwise from the arena's x axis; headings are clockwise in the robot's
+own frame. With the frame's forward axis at the arena angle F, heading h is the arena angle F - h.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+from shapely.geometry import Polygon
+
+from lab.base.errors import RequestError
+from robot.virtual.walls import Walls
+
+Floats = NDArray[np.float64]
+LightAt = Callable[[Floats, Floats], Floats]
+TURN = 2.0 * math.pi
+# A drift bends the path; it is followed in chords of at most this time, and of this sagitta near a wall.
+_MAX_STEP_S = 0.1
+_SAGITTA_CM = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class BodySettings:
+    """Physics of the virtual robot.
+
+    Attributes:
+        acceleration_cm_s2: Rate at which the speed rises and falls.
+        turn_rate_rad_s: Rate at which it turns on the spot before it rolls off.
+        speed_error: Standard deviation of the relative speed error, drawn anew for each run.
+        drift_rad_per_cm: Standard deviation of the path's curvature, drawn anew for each run: the gyro
+            believes that it goes straight.
+        locator_error: Standard deviation of the odometer's relative scale error, drawn once.
+        bump_angle_rad: Standard deviation of the error in the felt direction of a wall.
+        drive_timeout_s: It stops by itself this long after the last drive command.
+        light_noise_lux: Standard deviation of one light reading.
+        footprint_cm: Radius of the disc over which the light sensor averages.
+        led_leak_lux: Light that the own LED, at full level, adds to a reading.
+        battery_full_v: Voltage at the start.
+        battery_empty_v: Voltage at which it is empty.
+        battery_rest_s: Time at rest that empties it.
+        battery_roll_s: Rolling time that empties it.
+    """
+
+    acceleration_cm_s2: float = 80.0
+    turn_rate_rad_s: float = 8.0
+    speed_error: float = 0.02
+    drift_rad_per_cm: float = 2e-4
+    locator_error: float = 0.005
+    bump_angle_rad: float = 0.03
+    drive_timeout_s: float = 2.0
+    light_noise_lux: float = 1.0
+    footprint_cm: float = 0.5
+    led_leak_lux: float = 0.0
+    battery_full_v: float = 4.1
+    battery_empty_v: float = 3.4
+    battery_rest_s: float = 36_000.0
+    battery_roll_s: float = 9_000.0
+
+    def __post_init__(self) -> None:
+        above = ("acceleration_cm_s2", "turn_rate_rad_s", "drive_timeout_s", "battery_rest_s", "battery_roll_s")
+        for field in fields(self):
+            value = float(getattr(self, field.name))
+            if not math.isfinite(value) or value < 0 or (field.name in above and value == 0):
+                least = "above 0" if field.name in above else "0 or more"
+                raise RequestError(f"virtual robot: `{field.name}` must be {least}, got {value:g}")
+
+
+@dataclass(frozen=True, slots=True)
+class Impact:
+    """The ball met a wall at ``t_s``.
+
+    ``normal_heading_rad`` is the felt heading, in the robot's frame, from the wall into the arena, in
+    [0, 2π); ``heading_rad`` the heading it rolled along; ``speed_cm_s`` its speed across the wall.
+    """
+
+    t_s: float
+    normal_heading_rad: float
+    heading_rad: float
+    speed_cm_s: float
+
+
+class Body:
+    """A rolling ball.
+
+    Args:
+        reachable: Convex polygon that the ball's centre moves in, arena cm.
+        light_at: Light in lux, at the sensor's height, for arrays x and y of arena cm, shape (n,) each.
+        rng: Source of every draw.
+        settings: The physics.
+        position_cm: Where it starts; drawn evenly over ``reachable`` when not given.
+        facing_rad: The arena angle that it faces; drawn when not given. Its frame starts along it.
+
+    Attributes:
+        x_cm, y_cm: The ball's centre in the arena.
+        speed_cm_s: Speed now.
+        distance_cm: Path rolled since the start.
+        led_level: Brightness of its LED, 0 to 1.
+        on_bump: Called from within ``advance`` for each ``Impact``.
+
+    Raises:
+        RequestError: ``reachable`` is empty or not convex, or ``position_cm`` is outside it.
+    """
+
+    def __init__(
+        self,
+        reachable: Polygon,
+        light_at: LightAt,
+        rng: Generator,
+        settings: BodySettings | None = None,
+        *,
+        position_cm: tuple[float, float] | None = None,
+        facing_rad: float | None = None,
+    ) -> None:
+        self.settings = settings if settings is not None else BodySettings()
+        self._rng = rng
+        self._light_at = light_at
+        self._walls = Walls(reachable)
+        self.x_cm, self.y_cm = self._walls.draw(rng) if position_cm is None else position_cm
+        if not self._walls.contains(self.x_cm, self.y_cm):
+            raise RequestError(f"virtual robot: its start ({self.x_cm:g}, {self.y_cm:g}) cm is outside the arena")
+        self.speed_cm_s = 0.0
+        self.distance_cm = 0.0
+        self.led_level = 0.0
+        self.on_bump: Callable[[Impact], None] | None = None
+        self._t_s: float | None = None
+        # Frame: arena angle of heading 0 as it truly is; the gyro's drift turns it without the robot knowing.
+        self._frame_rad: float = float(rng.uniform(0.0, TURN)) if facing_rad is None else facing_rad
+        self._heading_rad = 0.0
+        self._wanted_heading_rad = 0.0
+        self._wanted_speed_cm_s = 0.0
+        self._deadline_s = math.inf
+        self._gain = 1.0
+        self._drift_rad_per_cm = 0.0
+        self._pressed = False
+        self._locator_scale = 1.0 + self.settings.locator_error * float(rng.standard_normal())
+        self._locator_x_cm = 0.0
+        self._locator_y_cm = 0.0
+        self._battery = 1.0
+        self._footprint_x, self._footprint_y = _footprint(self.settings.footprint_cm)
+
+    @property
+    def t_s(self) -> float:
+        """The instant it has been advanced to; 0 before the first ``advance``."""
+        return 0.0 if self._t_s is None else self._t_s
+
+    @property
+    def facing_rad(self) -> float:
+        """Arena angle that it faces, counter-clockwise from x, in [0, 2π)."""
+        return (self._frame_rad - self._heading_rad) % TURN
+
+    @property
+    def heading_rad(self) -> float:
+        """Heading that it believes to face, clockwise in its own frame."""
+        return self._heading_rad
+
+    @property
+    def locator_cm(self) -> tuple[float, float]:
+        """Odometer: x (right) and y (forward) in the robot's frame."""
+        return self._locator_x_cm, self._locator_y_cm
+
+    @property
+    def locator_speed_cm_s(self) -> float:
+        """Speed as the odometer measures it."""
+        return self.speed_cm_s * self._locator_scale
+
+    @property
+    def battery_v(self) -> float:
+        """Battery voltage, V, falling evenly with its charge."""
+        settings = self.settings
+        return settings.battery_empty_v + (settings.battery_full_v - settings.battery_empty_v) * self._battery
+
+    @property
+    def moving(self) -> bool:
+        """Whether it rolls, or is told to."""
+        return self.speed_cm_s > 0 or self._wanted_speed_cm_s > 0
+
+    @property
+    def pressed(self) -> bool:
+        """Whether it stands against a wall that its heading points into."""
+        return self._pressed
+
+    def drive(self, heading_rad: float, speed_cm_s: float) -> None:
+        """Roll along ``heading_rad`` at ``speed_cm_s`` from the present instant; speed 0 brakes.
+
+        The same heading again only moves the time-out on. Another one makes it brake, turn on the spot
+        and roll off: a new run, with its own errors.
+        """
+        rng, settings = self._rng, self.settings
+        turned = abs(math.remainder(heading_rad - self._wanted_heading_rad, TURN)) > 1e-6
+        if speed_cm_s > 0 and (turned or self._wanted_speed_cm_s == 0):
+            self._gain = max(0.0, 1.0 + settings.speed_error * float(rng.standard_normal()))
+            self._drift_rad_per_cm = settings.drift_rad_per_cm * float(rng.standard_normal())
+        self._wanted_heading_rad = heading_rad % TURN
+        self._wanted_speed_cm_s = max(0.0, speed_cm_s)
+        self._deadline_s = self.t_s + settings.drive_timeout_s if speed_cm_s > 0 else math.inf
+
+    def stop(self) -> None:
+        """Brake, heading as before."""
+        self.drive(self._wanted_heading_rad, 0.0)
+
+    def reset_yaw(self) -> None:
+        """Make the way it faces now heading 0."""
+        self._frame_rad = self.facing_rad
+        self._heading_rad = 0.0
+        self._wanted_heading_rad = 0.0
+
+    def reset_locator(self) -> None:
+        """Make the present position the odometer's origin."""
+        self._locator_x_cm = 0.0
+        self._locator_y_cm = 0.0
+
+    def light_lux(self) -> float:
+        """One reading of the light sensor where it stands: footprint mean, own LED and noise, lux (>= 0)."""
+        light = self._light_at(self._footprint_x + self.x_cm, self._footprint_y + self.y_cm)
+        mean = float(light.sum()) / light.size
+        settings = self.settings
+        noise = settings.light_noise_lux * self._rng.standard_normal() if settings.light_noise_lux else 0.0
+        return max(0.0, mean + settings.led_leak_lux * self.led_level + noise)
+
+    def advance(self, t_s: float) -> None:
+        """Move on to the instant ``t_s``; an instant already passed changes nothing.
+
+        The first call sets the clock.
+        """
+        if self._t_s is None:
+            self._t_s = t_s
+            return
+        while self._t_s < t_s:
+            if self._t_s >= self._deadline_s:
+                self._wanted_speed_cm_s = 0.0
+                self._deadline_s = math.inf
+            self._step(self._t_s, min(t_s, self._deadline_s) - self._t_s)
+
+    def _step(self, t_s: float, dt_s: float) -> None:
+        """Live through at most ``dt_s`` in which the acceleration does not change."""
+        settings = self.settings
+        rolls = self.speed_cm_s > 0
+        astray = abs(math.remainder(self._wanted_heading_rad - self._heading_rad, TURN))
+        aim_cm_s = self._wanted_speed_cm_s * self._gain
+        if astray > 1e-9 and aim_cm_s > 0:
+            if not rolls:
+                self._turn(t_s, dt_s)
+                return
+            aim_cm_s = 0.0
+        if not rolls and (aim_cm_s == 0 or self._faces_wall()):
+            self._battery = max(0.0, self._battery - dt_s / settings.battery_rest_s)
+            self._t_s = t_s + dt_s
+            return
+        speed = self.speed_cm_s
+        acceleration = 0.0
+        until_s = math.inf
+        if speed != aim_cm_s:
+            acceleration = math.copysign(settings.acceleration_cm_s2, aim_cm_s - speed)
+            until_s = (aim_cm_s - speed) / acceleration
+        step_s = min(dt_s, _MAX_STEP_S, until_s)
+        self._roll(t_s, step_s, acceleration, aim_cm_s if step_s == until_s else speed + acceleration * step_s)
+
+    def _turn(self, t_s: float, dt_s: float) -> None:
+        """Turn on the spot towards the wanted heading, the short way."""
+        left = math.remainder(self._wanted_heading_rad - self._heading_rad, TURN)
+        turned_s = min(dt_s, abs(left) / self.settings.turn_rate_rad_s)
+        if turned_s < dt_s:
+            self._heading_rad = self._wanted_heading_rad
+        else:
+            self._heading_rad = (
+                self._heading_rad + math.copysign(self.settings.turn_rate_rad_s * turned_s, left)
+            ) % TURN
+        self._pressed = False
+        self._battery = max(0.0, self._battery - turned_s / self.settings.battery_rest_s)
+        # A turn that ends within one rounding of t_s must still end.
+        self._t_s = max(t_s + turned_s, math.nextafter(t_s, math.inf))
+
+    def _faces_wall(self) -> bool:
+        """Whether it stands against a wall that it faces: it pushes, but does not move."""
+        if not self._pressed:
+            facing = self.facing_rad
+            self._pressed = self._walls.blocks(self.x_cm, self.y_cm, math.cos(facing), math.sin(facing))
+        return self._pressed
+
+    def _roll(self, t_s: float, step_s: float, acceleration: float, end_speed_cm_s: float) -> None:
+        """Roll for ``step_s``, or until the wall."""
+        speed = self.speed_cm_s
+        way_cm = max(0.0, (speed + end_speed_cm_s) / 2.0 * step_s)
+        angle = self._frame_rad - self._heading_rad + self._drift_rad_per_cm * way_cm / 2.0
+        along_x, along_y = math.cos(angle), math.sin(angle)
+        hit = self._walls.hit(self.x_cm, self.y_cm, along_x, along_y, way_cm)
+        impact_cm_s = 0.0
+        if hit is not None and abs(self._drift_rad_per_cm) * way_cm * way_cm > 8.0 * _SAGITTA_CM:
+            # Near a wall the chord must not leave the arc: come closer first.
+            self._roll(t_s, step_s / 2.0, acceleration, speed + acceleration * step_s / 2.0)
+            return
+        if hit is not None:
+            way_cm = hit.distance_cm
+            # Time to roll the way: root of v t + a t²/2 = d, in the form that does not cancel.
+            impact_cm_s = math.sqrt(max(0.0, speed * speed + 2.0 * acceleration * way_cm))
+            both = speed + impact_cm_s
+            step_s = min(step_s, 2.0 * way_cm / both) if both > 0 else step_s
+            end_speed_cm_s = 0.0
+        self.x_cm += way_cm * along_x
+        self.y_cm += way_cm * along_y
+        self.distance_cm += way_cm
+        self.speed_cm_s = end_speed_cm_s
+        self._frame_rad += self._drift_rad_per_cm * way_cm
+        felt_cm = way_cm * self._locator_scale
+        self._locator_x_cm += felt_cm * math.sin(self._heading_rad)
+        self._locator_y_cm += felt_cm * math.cos(self._heading_rad)
+        self._battery = max(0.0, self._battery - step_s / self.settings.battery_roll_s)
+        self._t_s = max(t_s + step_s, math.nextafter(t_s, math.inf))
+        if hit is not None:
+            self._pressed = True
+            self._bump(hit.normal_rad, max(0.0, -math.cos(hit.normal_rad - angle)) * impact_cm_s)
+
+    def _bump(self, normal_rad: float, speed_cm_s: float) -> None:
+        if self.on_bump is None:
+            return
+        error_rad = self.settings.bump_angle_rad * float(self._rng.standard_normal())
+        normal_heading_rad = (self._frame_rad - normal_rad + error_rad) % TURN
+        self.on_bump(Impact(self.t_s, normal_heading_rad, self._heading_rad, speed_cm_s))
+
+
+def _footprint(radius_cm: float) -> tuple[Floats, Floats]:
+    """Thirteen points (13,), (13,) that stand for a disc: the centre and rings of 4 and 8, each for a like area.
+
+    The rings lie at the root mean square radius of the area they stand for, so the second moment of the
+    disc, R²/4 about each axis, is kept within 1 %.
+    """
+    rings = [(1, 0.0), (4, math.sqrt(3 / 13)), (8, math.sqrt(9 / 13))]
+    points = [
+        (radius * math.cos(TURN * (i + 0.5) / count), radius * math.sin(TURN * (i + 0.5) / count))
+        for count, radius in rings
+        for i in range(count)
+    ]
+    array = radius_cm * np.asarray(points, dtype=float)
+    return np.ascontiguousarray(array[:, 0]), np.ascontiguousarray(array[:, 1])

@@ -1,0 +1,244 @@
+"""A virtual BOLT on a virtual radio: its GATT table, its manners, and the timers that drive its body."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import re
+from dataclasses import dataclass
+
+from lab.base.errors import RequestError
+from robot import commands
+from robot.link import ANTI_DOS_UUID, ANTI_DOS_WORDS, COMMANDS_UUID
+from robot.packets import Flag, PacketParser
+from robot.virtual.body import Body
+from robot.virtual.firmware import Firmware, FirmwareSettings
+from robot.virtual.radio import CONNECTION_TIMEOUT, GattCharacteristic, GattService, Peripheral, VirtualRadio
+
+_BASE = "-574f-4f20-5370-6865726f2121"
+SERVICES = (
+    GattService(f"00010001{_BASE}", (GattCharacteristic(COMMANDS_UUID, write=True, notify=True),)),
+    GattService(
+        f"00020001{_BASE}",
+        (
+            GattCharacteristic(f"00020002{_BASE}", write=True, notify=True),
+            GattCharacteristic(f"00020004{_BASE}", read=True),
+            GattCharacteristic(ANTI_DOS_UUID, write=True),
+        ),
+    ),
+)
+# A rolling body without a stream is looked at this often, so that it reports its collisions.
+_PULSE_S = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class BoltSettings:
+    """Manners of the virtual BOLT.
+
+    Attributes:
+        cm_s_per_unit: True speed of one unit of the speed byte on this floor.
+        anti_dos_s: A central that has not said the words within this time is dropped.
+        inactivity_s: After this long without a command it announces that it will sleep.
+        sleep_notice_s: Time from the announcement to sleep.
+        chunk_bytes: Longest piece that a frame is cut into; 0 for what the link's MTU allows.
+        firmware: Version.
+    """
+
+    cm_s_per_unit: float = 0.59
+    anti_dos_s: float = 10.0
+    inactivity_s: float = 120.0
+    sleep_notice_s: float = 10.0
+    chunk_bytes: int = 0
+    firmware: tuple[int, int, int] = (6, 0, 46)
+
+    def __post_init__(self) -> None:
+        times = (self.cm_s_per_unit, self.anti_dos_s, self.inactivity_s, self.sleep_notice_s)
+        if not all(math.isfinite(value) and value > 0 for value in times) or self.chunk_bytes < 0:
+            raise RequestError("virtual BOLT: its scale and times must be above 0, `chunk_bytes` 0 or more")
+
+
+class VirtualBolt:
+    """A BOLT that lives in this process.
+
+    Args:
+        radio: The radio it advertises on, already started when ``start`` is called.
+        body: What rolls and sees.
+        name: "SB-" and four hexadecimal digits; its address follows from them.
+        settings: Its manners.
+
+    Raises:
+        RequestError: The name is not a BOLT's.
+    """
+
+    def __init__(
+        self, radio: VirtualRadio, body: Body, name: str = "SB-1234", settings: BoltSettings | None = None
+    ) -> None:
+        if not re.fullmatch(r"SB-[0-9A-Fa-f]{4}", name):
+            raise RequestError(f"virtual BOLT: {name!r} is no BOLT's name; call it SB- and four hexadecimal digits")
+        self.name = name
+        self.body = body
+        self.settings = settings if settings is not None else BoltSettings()
+        digits = name[3:].upper()
+        # The two top bits set make it a static random address.
+        self.address = f"D0:5F:B8:00:{digits[:2]}:{digits[2:]}"
+        self._radio = radio
+        self._peripheral: Peripheral | None = None
+        self._parser = PacketParser()
+        self._firmware = Firmware(
+            body,
+            FirmwareSettings(
+                cm_s_per_unit=self.settings.cm_s_per_unit,
+                version=self.settings.firmware,
+                mac=self.address.replace(":", "").lower(),
+            ),
+            self._send,
+        )
+        self._trusted = False
+        self._pulse: asyncio.TimerHandle | None = None
+        self._next_frame_s = math.inf
+        self._guard: asyncio.TimerHandle | None = None
+        self._drowsy: asyncio.TimerHandle | None = None
+        self._last_activity_s = 0.0
+        self._hiding: asyncio.Task[None] | None = None
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether a host holds the link."""
+        return self._peripheral is not None and self._peripheral.is_connected
+
+    @property
+    def asleep(self) -> bool:
+        """Whether it has gone to sleep."""
+        return self._firmware.asleep
+
+    async def start(self) -> None:
+        """Switch it on: it advertises.
+
+        Raises:
+            RequestError: Another robot on the radio has the same address.
+        """
+        if self._peripheral is not None:
+            return
+        peripheral = await self._radio.add_peripheral(self.name, self.address, SERVICES)
+        peripheral.on_connect = self._connected
+        peripheral.on_disconnect = self._disconnected
+        peripheral.on_write = self._written
+        self._peripheral = peripheral
+        self.body.advance(asyncio.get_running_loop().time())
+        await peripheral.start()
+
+    async def close(self) -> None:
+        """Switch it off."""
+        peripheral, self._peripheral = self._peripheral, None
+        self._forget_host()
+        if peripheral is not None:
+            await peripheral.close()
+
+    def drop_link(self) -> None:
+        """Break the link as if the robot had gone out of range."""
+        if self._peripheral is not None:
+            self._peripheral.hang_up(CONNECTION_TIMEOUT)
+
+    def _connected(self) -> None:
+        loop = asyncio.get_running_loop()
+        self._parser = PacketParser()
+        self._firmware.boot()
+        self._trusted = False
+        self._guard = loop.call_later(self.settings.anti_dos_s, self._check_words)
+        self._last_activity_s = loop.time()
+        self._drowsy = loop.call_later(self.settings.inactivity_s, self._grow_drowsy)
+
+    def _disconnected(self) -> None:
+        self.body.advance(asyncio.get_running_loop().time())
+        self._forget_host()
+        if self._firmware.wants_deep_sleep and self._peripheral is not None:
+            self._hiding = asyncio.get_running_loop().create_task(self._peripheral.hide())
+
+    def _forget_host(self) -> None:
+        """End the timers; a body that still rolls stops by its own time-out, in ``advance``."""
+        for timer in (self._pulse, self._guard, self._drowsy):
+            if timer is not None:
+                timer.cancel()
+        self._pulse = self._guard = self._drowsy = None
+        self._next_frame_s = math.inf
+
+    def _check_words(self) -> None:
+        if not self._trusted and self._peripheral is not None:
+            self._peripheral.hang_up()
+
+    def _written(self, uuid: str, value: bytes) -> None:
+        if uuid == ANTI_DOS_UUID:
+            self._trusted = self._trusted or value == ANTI_DOS_WORDS
+        elif uuid == COMMANDS_UUID:
+            now_s = asyncio.get_running_loop().time()
+            self.body.advance(now_s)
+            firmware = self._firmware
+            for packet in self._parser.feed(value):
+                if packet.flags & Flag.ACTIVITY:
+                    self._last_activity_s = now_s
+                streamed_s = firmware.stream_interval_s
+                firmware.handle(packet)
+                if firmware.stream_interval_s != streamed_s:
+                    self._next_frame_s = now_s + firmware.stream_interval_s if firmware.stream_interval_s else math.inf
+            if firmware.wants_deep_sleep and self._peripheral is not None:
+                # Time for the answer to leave.
+                asyncio.get_running_loop().call_later(_PULSE_S, self._peripheral.hang_up)
+            self._arm()
+
+    def _arm(self) -> None:
+        """Set the timer for whatever is next: a stream frame, or a look at the rolling body."""
+        if self._pulse is not None:
+            self._pulse.cancel()
+            self._pulse = None
+        if not self.is_connected:
+            return
+        loop = asyncio.get_running_loop()
+        at_s = self._next_frame_s if self._firmware.stream_interval_s else math.inf
+        if self.body.moving:
+            at_s = min(at_s, loop.time() + _PULSE_S)
+        if at_s < math.inf:
+            self._pulse = loop.call_at(at_s, self._beat)
+
+    def _beat(self) -> None:
+        self._pulse = None
+        now_s = asyncio.get_running_loop().time()
+        firmware = self._firmware
+        self.body.advance(now_s)
+        # Timers may fire a clock's resolution early.
+        if firmware.stream_interval_s and now_s >= self._next_frame_s - 1e-6:
+            firmware.stream_frame()
+            self._next_frame_s += firmware.stream_interval_s
+            if self._next_frame_s < now_s:
+                self._next_frame_s = now_s + firmware.stream_interval_s
+        self._arm()
+
+    def _grow_drowsy(self) -> None:
+        """Announce sleep after long inactivity, and fall asleep when nothing came of it."""
+        loop = asyncio.get_running_loop()
+        settings = self.settings
+        quiet_s = loop.time() - self._last_activity_s
+        if self._firmware.asleep:
+            wait_s = settings.inactivity_s
+        elif quiet_s < settings.inactivity_s - 1e-6:
+            wait_s = settings.inactivity_s - quiet_s
+        elif quiet_s < settings.inactivity_s + settings.sleep_notice_s - 1e-6:
+            self._firmware.notify(commands.WILL_SLEEP)
+            wait_s = settings.inactivity_s + settings.sleep_notice_s - quiet_s
+        else:
+            self.body.advance(loop.time())
+            self._firmware.fall_asleep()
+            wait_s = settings.inactivity_s
+        self._drowsy = loop.call_later(wait_s, self._grow_drowsy)
+
+    def _send(self, frame: bytes) -> None:
+        peripheral = self._peripheral
+        if peripheral is None:
+            return
+        size = peripheral.payload_bytes
+        if self.settings.chunk_bytes:
+            size = min(size, self.settings.chunk_bytes)
+        if len(frame) <= size:
+            peripheral.notify(COMMANDS_UUID, frame)
+            return
+        for start in range(0, len(frame), size):
+            peripheral.notify(COMMANDS_UUID, frame[start : start + size])

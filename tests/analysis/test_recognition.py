@@ -1,0 +1,230 @@
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy import stats
+from shapely import affinity
+from shapely.geometry import box
+
+from analysis.montecarlo import Lines, simulate_crossings, simulate_lines
+from analysis.perline import LineModel, LineRecogniser, learn_tables, sensed_moments
+from analysis.quadrature import exact_moments
+from analysis.recognition import FIRST_POSTERIOR_N, GaussianRecogniser, Recogniser
+from lab.base.errors import RequestError
+
+SIX = ("circle", "square", "triangle", "pyramid", "tower", "statue")
+SENSOR = LineModel(jitter_cm=0.4, min_chord_cm=1.25, scale_sigma=0.02)
+
+
+@pytest.fixture(scope="module")
+def six(shapes):
+    return {name: shapes[name] for name in SIX}
+
+
+@pytest.fixture(scope="module")
+def moments(six):
+    return {name: exact_moments(geometry) for name, geometry in six.items()}
+
+
+@pytest.fixture(scope="module")
+def tables(six):
+    return learn_tables(six, np.random.default_rng(1))
+
+
+@pytest.fixture(scope="module")
+def sensed_tables(six):
+    return learn_tables(six, np.random.default_rng(2), model=SENSOR)
+
+
+def share_right(recogniser, six, lines, runs, rng, model=None):
+    """Share of the runs that end with the right name first, for each shape."""
+    right = {}
+    for name, geometry in six.items():
+        good = 0
+        for _ in range(runs):
+            thrown = simulate_crossings(geometry, lines, rng)
+            recogniser.reset()
+            recogniser.update_many(*(model.observe(thrown, rng) if model else thrown).invariants())
+            good += recogniser.ranked()[0][0] == name
+        right[name] = good / runs
+    return right
+
+
+def test_area_and_perimeter_recognise_six_shapes_in_300_lines(six, moments, rng):
+    right = share_right(GaussianRecogniser(moments), six, 300, 100, rng)
+    assert np.mean(list(right.values())) >= 0.95
+    assert min(right.values()) >= 0.9
+
+
+def test_single_lines_recognise_six_shapes_in_100_lines(six, tables, rng):
+    assert min(share_right(LineRecogniser(tables), six, 100, 100, rng).values()) >= 0.95
+
+
+@pytest.mark.parametrize("scale_sigma", [0.01, 0.03])
+def test_an_imperfect_sensor_is_met_by_a_matched_dictionary(six, sensed_tables, scale_sigma, rng):
+    world = LineModel(jitter_cm=0.4, min_chord_cm=1.25, scale_sigma=scale_sigma)
+    right = share_right(LineRecogniser(sensed_tables), six, 60, 60, rng, world)
+    assert min(right.values()) >= 0.95
+
+
+def test_a_systematic_error_of_length_is_borne(six, sensed_tables, rng):
+    for factor in (0.97, 1.03):
+        stretched = {name: affinity.scale(geometry, factor, factor) for name, geometry in six.items()}
+        right = share_right(LineRecogniser(sensed_tables), stretched, 100, 40, rng, SENSOR)
+        assert min(right.values()) >= 0.92
+
+
+def test_sensed_moments_put_the_area_and_perimeter_recogniser_right(six, moments, rng):
+    sensed = {name: sensed_moments(geometry, SENSOR, rng) for name, geometry in six.items()}
+    assert sensed["statue"].perimeter_cm < 0.95 * moments["statue"].perimeter_cm
+    plain = share_right(GaussianRecogniser(moments), six, 100, 60, rng, SENSOR)["statue"]
+    matched = share_right(GaussianRecogniser(sensed), six, 100, 60, rng, SENSOR)["statue"]
+    assert matched > plain
+    blind = LineModel(min_chord_cm=1e9)
+    with pytest.raises(RequestError, match="sees nothing"):
+        sensed_moments(six["square"], blind, rng)
+    ideal = sensed_moments(six["tower"], LineModel(), rng)
+    assert ideal.area_cm2 == pytest.approx(six["tower"].area, rel=5 * ideal.error)
+    assert ideal.hitting_measure_cm == pytest.approx(moments["tower"].hitting_measure_cm, rel=0.01)
+
+
+def test_posterior_means_what_it_says(six, tables, rng):
+    # Over many runs stopped after a few lines, the leader is right as often as its posterior claims.
+    claimed, right = [], []
+    recogniser = LineRecogniser(tables)
+    for name, geometry in six.items():
+        for k, l1, l3 in zip(*(c.reshape(150, 8) for c in simulate_lines(geometry, 150 * 8, rng)), strict=True):
+            recogniser.reset()
+            recogniser.update_many(k, l1, l3)
+            leader, posterior = recogniser.ranked()[0]
+            claimed.append(posterior)
+            right.append(leader == name)
+    assert np.mean(right) == pytest.approx(np.mean(claimed), abs=0.05)
+
+
+def both(moments, tables):
+    return GaussianRecogniser(moments), LineRecogniser(tables)
+
+
+def test_both_have_the_same_face(moments, tables, six, rng):
+    k, l1, l3 = simulate_lines(six["tower"], 40, rng)
+    for recogniser in both(moments, tables):
+        assert isinstance(recogniser, Recogniser)
+        assert recogniser.names == SIX
+        assert recogniser.n == 0
+        assert_allclose(list(recogniser.posterior().values()), 1 / 6)
+        for line in zip(k, l1, l3, strict=True):
+            recogniser.update(*line)
+        recogniser.update(0, 0.0, 0.0)
+        assert recogniser.n == 40
+        one_by_one = recogniser.posterior()
+        assert sum(one_by_one.values()) == pytest.approx(1)
+        ranked = recogniser.ranked()
+        assert ranked[0] == ("tower", max(one_by_one.values()))
+        assert [p for _, p in ranked] == sorted(one_by_one.values(), reverse=True)
+        recogniser.reset()
+        recogniser.update_many(k, l1, l3)
+        assert recogniser.posterior() == pytest.approx(one_by_one)
+
+
+def test_no_gaussian_posterior_from_a_handful_of_lines(moments, six, rng):
+    recogniser = GaussianRecogniser(moments)
+    k, l1, l3 = simulate_lines(six["circle"], FIRST_POSTERIOR_N, rng)
+    recogniser.update_many(k[:-1], l1[:-1], l3[:-1])
+    assert_allclose(list(recogniser.posterior().values()), 1 / 6)
+    recogniser.update(k[-1], l1[-1], l3[-1])
+    assert max(recogniser.posterior().values()) > 0.5
+
+
+def test_gaussian_likelihood_is_the_normal_density(moments):
+    recogniser = GaussianRecogniser(moments)
+    area, perimeter, n = 420.0, 100.0, 40
+    density = {}
+    for name, m in moments.items():
+        c = m.covariance / np.outer(m.mean, m.mean) / n
+        bias = np.array([c[1, 1] - c[1, 2], 3 * c[1, 1] + c[0, 2] - 2 * c[1, 2] - 2 * c[0, 1]])
+        mean = np.array([m.area_cm2, m.perimeter_cm]) * (1 + bias)
+        density[name] = stats.multivariate_normal(mean, m.covariance_at(n)).pdf([area, perimeter])
+    total = sum(density.values())
+    assert recogniser.posterior_at(area, perimeter, n) == pytest.approx({k: v / total for k, v in density.items()})
+
+
+def test_nothing_over_or_underflows(moments, tables):
+    far = GaussianRecogniser(moments).posterior_at(1e6, 1e5, 1e9)
+    assert sum(far.values()) == pytest.approx(1)
+    recogniser = LineRecogniser(tables)
+    recogniser.update_many(np.full(10_000, 40), np.full(10_000, 1e4), np.full(10_000, 1e14))
+    recogniser.update(1, 1e-12, 0.0)
+    assert all(np.isfinite(p) for p in recogniser.posterior().values())
+    assert np.isfinite(tables.log_probability).all()
+
+
+def test_misfit_tells_a_shape_that_is_in_no_entry(moments):
+    recogniser = GaussianRecogniser(moments)
+    m = moments["square"]
+    known = recogniser.misfit(m.area_cm2, m.perimeter_cm, 500)
+    assert known["square"] < 1 < known["circle"]
+    assert min(recogniser.misfit(2000.0, 100.0, 500).values()) > 14
+
+
+def test_a_line_that_no_entry_explains_moves_nobody_far(tables):
+    recogniser = LineRecogniser(tables)
+    recogniser.update(8, 1.0, 900.0)
+    assert max(recogniser.posterior().values()) < 0.9
+
+
+def test_priors_and_weights(moments, tables, six, rng):
+    prior = dict.fromkeys(SIX, 1.0) | {"statue": 5.0}
+    for recogniser in (GaussianRecogniser(moments, prior=prior), LineRecogniser(tables, prior=prior)):
+        assert recogniser.posterior()["statue"] == pytest.approx(0.5)
+    lines = simulate_lines(six["square"], 10, rng)
+    full, half = LineRecogniser(tables), LineRecogniser(tables, weight=0.5)
+    full.update_many(*lines)
+    half.update_many(*lines)
+    ratio = [np.log(r.posterior()["square"] / r.posterior()["pyramid"]) for r in (full, half)]
+    assert ratio[1] == pytest.approx(ratio[0] / 2)
+    with pytest.raises(RequestError, match="weight"):
+        LineRecogniser(tables, weight=0)
+    with pytest.raises(RequestError, match="prior"):
+        GaussianRecogniser(moments, prior={"circle": 1.0})
+    with pytest.raises(RequestError, match="empty"):
+        learn_tables({}, rng)
+
+
+def test_shapes_of_one_area_and_perimeter_differ_line_by_line(rng):
+    # The same pieces set apart differently: (A, P) are equal, the lines are not.
+    ell = box(0, 0, 20, 6).union(box(0, 0, 6, 20))
+    tee = box(0, 0, 20, 6).union(box(7, 0, 13, 20))
+    assert ell.area == tee.area
+    assert ell.length == tee.length
+    entries = {"ell": ell, "tee": tee}
+    recogniser = LineRecogniser(learn_tables(entries, rng))
+    assert min(share_right(recogniser, entries, 300, 40, rng).values()) >= 0.9
+
+
+def test_ideal_sensor_changes_nothing_and_each_fault_its_own(six, rng):
+    thrown = simulate_crossings(six["statue"], 5000, rng)
+    same = LineModel().observe(thrown, rng)
+    assert same.s_cm is thrown.s_cm
+    jittered = LineModel(jitter_cm=0.3).observe(thrown, rng)
+    assert np.std(jittered.s_cm - thrown.s_cm) == pytest.approx(0.3, rel=0.03)
+    scaled = LineModel(scale_sigma=0.02).observe(thrown, rng)
+    ratio = scaled.chords_cm / thrown.chords_cm
+    assert ratio.std() == pytest.approx(0.02, rel=0.1)
+    with pytest.raises(RequestError, match="jitter_cm"):
+        LineModel(jitter_cm=-1)
+
+
+def test_a_short_stretch_is_seen_in_proportion_to_its_length(rng):
+    n = 40_000
+    chords = Lines(np.tile([0.0, 0.5], n), np.full(n, 2))
+    assert LineModel(min_chord_cm=2.0).observe(chords, rng).counts.size / n == pytest.approx(0.25, abs=0.01)
+    gaps = Lines(np.tile([0.0, 7.0, 7.5, 15.0], n), np.full(n, 4))
+    seen = LineModel(min_chord_cm=2.0).observe(gaps, rng)
+    assert (seen.counts == 4).mean() == pytest.approx(0.25, abs=0.01)
+    k, l1, _ = seen.invariants()
+    assert_allclose(l1[k == 1], 15.0)
+
+
+@pytest.mark.slow
+def test_half_as_many_lines_with_every_sensor(six, sensed_tables, rng):
+    assert min(share_right(LineRecogniser(sensed_tables), six, 40, 1000, rng, SENSOR).values()) >= 0.95

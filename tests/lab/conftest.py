@@ -1,0 +1,42 @@
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+import pytest
+
+from lab.experiment import Finished, run_experiment
+from lab.session import Progress
+from lab.settings import load_settings
+
+STARTED = datetime(2026, 11, 23, 10, 42)
+
+
+@dataclass(frozen=True)
+class Rolled:
+    finished: Finished
+    steps: list[Progress]
+
+    @property
+    def folder(self) -> Path:
+        return self.finished.folder
+
+
+def roll(out: Path, **overrides) -> Rolled:
+    """A virtual session, without video unless asked."""
+    steps: list[Progress] = []
+    keys = {"out": str(out), "camera": "none", "stop.lines": 20} | {
+        name.replace("__", "."): value for name, value in overrides.items()
+    }
+    return Rolled(run_experiment(load_settings(None, keys), started=STARTED, watch=steps.append), steps)
+
+
+@pytest.fixture(scope="session")
+def square_session(tmp_path_factory) -> Rolled:
+    """150 lines over the square, no video."""
+    return roll(tmp_path_factory.mktemp("square"), shape="square", stop__lines=150, seed=5)
+
+
+@pytest.fixture(scope="session")
+def filmed_session(tmp_path_factory) -> Rolled:
+    """A dozen lines over the square, filmed."""
+    return roll(tmp_path_factory.mktemp("filmed"), shape="square", camera="virtual", stop__lines=12, seed=2)

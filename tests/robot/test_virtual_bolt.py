@@ -1,0 +1,347 @@
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import struct
+
+import numpy as np
+import pytest
+from bleak import BleakClient, BleakScanner
+from shapely.geometry import box
+
+from lab.base.errors import RequestError
+from lab.clock import run
+from robot import commands
+from robot.commands import COMMANDS, Collision, Request
+from robot.link import ANTI_DOS_UUID, ANTI_DOS_WORDS, COMMANDS_UUID
+from robot.packets import Packet, PacketParser, encode
+from robot.virtual.body import Body
+from robot.virtual.bolt import BoltSettings, VirtualBolt
+from robot.virtual.radio import AirSettings
+
+# Length of the answer to each command, from the protocol's table; 0 is a bare acknowledgement.
+ANSWER_BYTES = {
+    "API version": 2,
+    "main app version": 6,
+    "bootloader version": 6,
+    "MAC address": 12,
+    "battery voltage": 2,
+    "battery voltage state": 1,
+    "charger state": 1,
+    "streaming mask get": 7,
+    "extended mask get": 4,
+    "ambient light": 4,
+}
+EXAMPLES = {
+    "raw motors": bytes([1, 40, 1, 40]),
+    "drive": bytes([60, 0, 90, 0]),
+    "LEDs": bytes([0x03, 255, 128]),
+    "matrix pixel": bytes([7, 0, 255, 0, 0]),
+}
+
+
+class Client:
+    """A plain bleak client that speaks frames."""
+
+    def __init__(self, bench) -> None:
+        self.bench = bench
+        self.packets: list[Packet] = []
+        self.pieces: list[bytes] = []
+        self.parser = PacketParser()
+        self.gone = asyncio.Event()
+        self.seq = 0
+
+    @contextlib.asynccontextmanager
+    async def open(self, *, words: bool = True):
+        radio = self.bench.radio
+        device = await BleakScanner.find_device_by_name("SB-1234", backend=radio.scanner_backend)
+        async with BleakClient(device, lambda _: self.gone.set(), backend=radio.client_backend) as self.client:
+            if words:
+                await self.client.write_gatt_char(ANTI_DOS_UUID, ANTI_DOS_WORDS, response=True)
+            await self.client.start_notify(COMMANDS_UUID, self._received)
+            yield self
+
+    def _received(self, _, chunk: bytearray) -> None:
+        self.pieces.append(bytes(chunk))
+        self.packets += self.parser.feed(chunk)
+
+    async def ask(self, request: Request, *, response: bool = True) -> Packet:
+        self.seq += 1
+        return await self.send(request.packet(self.seq), response=response)
+
+    async def send(self, packet: Packet, *, response: bool = True) -> Packet:
+        await self.client.write_gatt_char(COMMANDS_UUID, encode(packet), response=response)
+        async with asyncio.timeout(1.0):
+            while True:
+                for answer in self.packets:
+                    if answer.is_response and answer.seq == packet.seq:
+                        self.packets.remove(answer)
+                        return answer
+                await asyncio.sleep(0.001)
+
+
+def session(bench, script, **options) -> None:
+    async def main() -> None:
+        async with bench(connect=False, **options) as b, Client(b).open() as client:
+            await script(b, client)
+
+    run(main(), virtual=True)
+
+
+def test_every_command_is_answered_with_its_length(bench) -> None:
+    async def script(_, client: Client) -> None:
+        for command in COMMANDS:
+            if command in (commands.SLEEP, commands.DEEP_SLEEP):
+                continue
+            data = EXAMPLES.get(command.name, bytes(struct.calcsize(f">{command.layout or ''}")))
+            answer = await client.ask(Request(command, data), response=command.did != 0x13)
+            assert (answer.did, answer.cid, answer.error) == (command.did, command.cid, 0), command.name
+            assert len(answer.data) == ANSWER_BYTES.get(command.name, 0), command.name
+            if command.target is None:
+                assert answer.flags == 0x09
+            else:
+                assert (answer.flags, answer.target, answer.source) == (0x39, 1, command.target)
+
+    session(bench, script)
+
+
+def test_what_it_cannot_do_is_refused_with_the_right_code(bench) -> None:
+    async def script(_, client: Client) -> None:
+        async def code(packet: Packet) -> int | None:
+            return (await client.send(packet)).error
+
+        assert await code(Packet(0x0A, 0x77, 0x00, 1)) == commands.BAD_DID
+        assert await code(Packet(0x0A, 0x13, 0x77, 2)) == commands.BAD_CID
+        assert await code(Packet(0x3A, 0x16, 0x06, 3, b"\x00", target=0x12, source=1)) == commands.BAD_LENGTH
+        assert await code(Packet(0x3A, 0x16, 0x06, 4, target=0x33, source=1)) == commands.BAD_TARGET
+        assert await code(Packet(0x3A, 0x16, 0x06, 5, target=0x11, source=1)) == commands.BAD_CID
+        for request in (
+            Request(commands.DRIVE, struct.pack(">BHB", 10, 360, 0)),
+            Request(commands.RAW_MOTORS, bytes([3, 0, 0, 0])),
+            Request(commands.MATRIX_PIXEL, bytes([8, 0, 1, 1, 1])),
+            Request(commands.STABILISATION, b"\x06"),
+        ):
+            assert (await client.ask(request)).error == commands.BAD_PARAMETER
+        assert (await client.ask(Request(commands.LEDS, b"\x03\x01"))).error == commands.BAD_LENGTH
+
+    session(bench, script)
+
+
+def test_answers_follow_the_style_of_the_question(bench) -> None:
+    async def script(_, client: Client) -> None:
+        only_target = await client.send(Packet(0x1A, 0x16, 0x06, 9, target=0x12))
+        assert (only_target.flags, only_target.target, only_target.source) == (0x29, None, 0x12)
+        # No answer wanted; answer wanted in case of error alone.
+        for flags in (0x08, 0x0E):
+            await client.client.write_gatt_char(COMMANDS_UUID, encode(Packet(flags, 0x13, 0x0D, 20)), response=False)
+        await asyncio.sleep(0.5)
+        assert not [packet for packet in client.packets if packet.is_response]
+        assert (await client.send(Packet(0x0E, 0x13, 0x77, 21))).error == commands.BAD_CID
+
+    session(bench, script)
+
+
+@pytest.mark.parametrize(("mtu", "chunk_bytes", "longest"), [(23, 0, 20), (185, 0, 182), (185, 1, 1), (23, 7, 7)])
+def test_frames_come_in_pieces_that_fit(bench, mtu: int, chunk_bytes: int, longest: int) -> None:
+    async def script(_, client: Client) -> None:
+        word = bytes([0xAB, 0x8D, 0xD8, 0x00]) * 12
+        assert (await client.ask(Request(commands.PING, word))).data == word
+        assert max(len(piece) for piece in client.pieces) <= longest
+        # 48 bytes, 36 of them escaped, in a frame of 8.
+        frame = sum(len(piece) for piece in client.pieces)
+        assert frame >= 48 + 36 + 8
+        assert len(client.pieces) == -(-frame // longest)
+
+    session(bench, script, air=AirSettings(mtu=mtu), manners=BoltSettings(chunk_bytes=chunk_bytes))
+
+
+def test_any_stream_has_its_interval_its_channels_and_its_count(bench) -> None:
+    async def script(b, client: Client) -> None:
+        times: list[float] = []
+        await client.ask(commands.stream(0, 0))
+        await client.ask(commands.stream_extended(0x03840000))
+        await client.ask(commands.stream(150, 0x03C7E27A, count=7))
+        client.packets.clear()
+        for _ in range(40):
+            await asyncio.sleep(0.05)
+            times += [asyncio.get_running_loop().time()] * (len(client.packets) - len(times))
+        assert len(client.packets) == 7
+        assert all((p.did, p.cid, p.seq, p.source) == (0x18, 0x02, 0xFF, 0x12) for p in client.packets)
+        assert {len(p.data) for p in client.packets} == {80}
+        assert np.diff(times) == pytest.approx([0.15] * 6, abs=0.051)
+        values = dict(
+            zip(
+                commands.layout_of(0x03C7E27A, 0x03840000).names,
+                struct.unpack(">20f", client.packets[-1].data),
+                strict=True,
+            )
+        )
+        assert values["acceleration_z_g"] == 1.0
+        assert values["quaternion_w"] == pytest.approx(1.0)
+        assert values["ambient_lux"] == pytest.approx(b.body.light_lux())
+        # The masks can be read back; a stream of nothing is none.
+        assert (await client.ask(Request(commands.STREAM_GET))).data == struct.pack(">HBI", 150, 7, 0x03C7E27A)
+        assert (await client.ask(Request(commands.STREAM_EXTENDED_GET))).data == struct.pack(">I", 0x03840000)
+        await client.ask(commands.stream_extended(0))
+        await client.ask(commands.stream(50, 0))
+        client.packets.clear()
+        await asyncio.sleep(1.0)
+        assert client.packets == []
+
+    session(bench, script)
+
+
+def test_yaw_locator_and_speed_are_those_of_the_body(bench) -> None:
+    async def script(b, client: Client) -> None:
+        names = ("yaw_deg", "locator_x_m", "locator_y_m", "velocity_x_m_s", "velocity_y_m_s", "speed_m_s")
+        layout = commands.layout_for(*names)
+        await client.ask(commands.stream(100, layout.primary))
+        await client.ask(commands.drive(50, np.pi / 2))
+        await asyncio.sleep(1.25)
+        yaw, x, y, vx, vy, speed = layout.decode(client.packets[-1].data)
+        assert yaw == pytest.approx(-90.0)
+        assert (vx, vy, speed) == pytest.approx((0.295, 0.0, 0.295), abs=1e-6)
+        assert y == pytest.approx(0.0, abs=1e-6)
+        assert 0.2 < x < 0.4
+        # 50 units are 29.5 cm/s; the last frame is less than one interval old.
+        assert b.body.distance_cm - 100 * x < 3.0
+
+    session(bench, script, facing_rad=0.0)
+
+
+def test_collisions_are_reported_only_when_asked_for(bench) -> None:
+    async def script(b, client: Client) -> None:
+        def collisions() -> list[Collision]:
+            return [Collision.decode(p.data) for p in client.packets if (p.did, p.cid) == commands.COLLISION.key]
+
+        async def ram(heading_rad: float) -> None:
+            for _ in range(5):
+                await client.ask(commands.drive(68, heading_rad))
+                await asyncio.sleep(1.0)
+
+        await ram(0.0)
+        assert b.body.pressed
+        assert collisions() == []
+        await client.ask(commands.collision_setup(1, (60, 60, 60, 60), 0.1))
+        await ram(np.pi)
+        (report,) = collisions()
+        # Head on: thrown back against the way it faces, and no stream was needed to say so.
+        assert report.y_g < -0.5
+        assert report.x_g == pytest.approx(0.0, abs=1e-3)
+        assert (report.axis, report.speed_units) == (2, 68)
+        assert report.t_robot_s < asyncio.get_running_loop().time()
+        await client.ask(commands.collision_setup(0, (60, 60, 60, 60), 0.1))
+        await ram(0.0)
+        assert len(collisions()) == 1
+
+    session(bench, script, facing_rad=0.0)
+
+
+def test_leds_show_in_the_body(bench) -> None:
+    async def script(b, client: Client) -> None:
+        await client.ask(commands.matrix_colour(0, 255, 0))
+        assert b.body.led_level == 1.0
+        await client.ask(commands.matrix_colour(0, 0, 0))
+        await client.ask(Request(commands.MATRIX_PIXEL, bytes([3, 4, 255, 255, 255])))
+        assert b.body.led_level == pytest.approx(1 / 64)
+
+    session(bench, script)
+
+
+def test_raw_motors_and_reverse_roll_it(bench) -> None:
+    async def script(b, client: Client) -> None:
+        await client.ask(Request(commands.RAW_MOTORS, bytes([1, 40, 1, 60])))
+        await asyncio.sleep(0.5)
+        assert b.body.x_cm > 2.0
+        await client.ask(Request(commands.RAW_MOTORS, bytes([0, 0, 0, 0])))
+        await asyncio.sleep(1.0)
+        x_cm = b.body.x_cm
+        await client.ask(commands.drive(50, 0.0, flags=0x01))
+        await asyncio.sleep(1.5)
+        assert b.body.x_cm < x_cm - 5.0
+        await client.ask(Request(commands.RAW_MOTORS, bytes([2, 40, 2, 40])))
+
+    session(bench, script, facing_rad=0.0)
+
+
+def test_a_host_that_does_not_say_the_words_is_dropped(bench) -> None:
+    async def main() -> None:
+        async with bench(connect=False) as b:
+            client = Client(b)
+            async with client.open(words=False):
+                start_s = asyncio.get_running_loop().time()
+                async with asyncio.timeout(20.0):
+                    await client.gone.wait()
+                assert asyncio.get_running_loop().time() - start_s == pytest.approx(10.0, abs=0.5)
+                assert not b.virtual.is_connected
+            polite = Client(b)
+            async with polite.open():
+                await asyncio.sleep(30.0)
+                assert b.virtual.is_connected
+
+    run(main(), virtual=True)
+
+
+def test_it_announces_sleep_sleeps_and_wakes(bench) -> None:
+    async def script(b, client: Client) -> None:
+        await client.ask(commands.stream(500, commands.layout_for("locator_x_m").primary))
+        await asyncio.sleep(40.0)
+        said = [(p.did, p.cid) for p in client.packets if p.did == 0x13]
+        assert said == [commands.WILL_SLEEP.key, commands.DID_SLEEP.key]
+        assert b.virtual.asleep
+        client.packets.clear()
+        await asyncio.sleep(3.0)
+        assert client.packets == []
+        assert (await client.ask(commands.drive(20, 0.0))).error == commands.TARGET_UNAVAILABLE
+        assert (await client.ask(Request(commands.WAKE))).error == 0
+        assert (await client.ask(commands.drive(20, 0.0))).error == 0
+        assert not b.virtual.asleep
+
+    session(bench, script, manners=BoltSettings(inactivity_s=20.0, sleep_notice_s=5.0))
+
+
+def test_deep_sleep_takes_it_off_the_air(bench) -> None:
+    async def main() -> None:
+        async with bench(connect=False) as b:
+            client = Client(b)
+            async with client.open():
+                with contextlib.suppress(TimeoutError):
+                    await client.ask(Request(commands.DEEP_SLEEP))
+                await asyncio.sleep(1.0)
+                assert not b.virtual.is_connected
+            assert await BleakScanner.find_device_by_name("SB-1234", 3.0, backend=b.radio.scanner_backend) is None
+
+    run(main(), virtual=True)
+
+
+def test_the_battery_state_follows_its_voltage(bench) -> None:
+    async def script(b, client: Client) -> None:
+        states = []
+        for charge in (1.0, 0.2, 0.05):
+            b.body._battery = charge
+            states.append((await client.ask(Request(commands.BATTERY_STATE))).data[0])
+        assert states == [1, 2, 3]
+
+    session(bench, script)
+
+
+def test_names_addresses_and_settings_are_checked(bench) -> None:
+    async def main() -> None:
+        async with bench(connect=False) as b:
+            body = Body(box(0, 0, 1, 1), lambda x, y: x, np.random.default_rng(1))
+            for name in ("Bolt", "SB-12345", "SB-XYZW"):
+                with pytest.raises(RequestError, match="no BOLT's name"):
+                    VirtualBolt(b.radio, body, name)
+            twin = VirtualBolt(b.radio, body, "SB-1234")
+            with pytest.raises(RequestError, match="is taken"):
+                await twin.start()
+            with pytest.raises(RequestError):
+                BoltSettings(anti_dos_s=0.0)
+            other = VirtualBolt(b.radio, body, "SB-ABCD")
+            await other.start()
+            await other.start()
+            found = await BleakScanner.discover(1.0, backend=b.radio.scanner_backend)
+            assert {device.name for device in found} == {"SB-1234", "SB-ABCD"}
+            await other.close()
+
+    run(main(), virtual=True)

@@ -1,0 +1,442 @@
+"""The recorder: what was filmed is what can be read, frame by frame, whatever goes wrong meanwhile."""
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+
+import numpy as np
+import pandas as pd
+import pytest
+from av.codec.codec import UnknownCodecError
+
+from lab.base.errors import RequestError
+from lab.base.pinhole import Pinhole
+from lab.clock import run
+from tracking import segment
+from tracking.cameras import CameraError, Frame
+from tracking.recorder import EncoderSettings, Recorder, RecorderError
+from tracking.segment import SegmentWriter, frames_table, part_of
+from tracking.synthetic import CameraSettings, RobotView
+from tracking.video import read_frames
+from tracking.virtual import VirtualCamera
+
+SIZE = (160, 90)
+OPTICS = Pinhole.looking_down(SIZE, height_cm=205.0, field_width_cm=165.0)
+
+
+def floor(x_cm, y_cm, height_cm):
+    return np.where(np.hypot(x_cm, y_cm) < 20, 120.0, 20.0)
+
+
+def virtual_camera(seed=1, **more) -> VirtualCamera:
+    def robots(t_s):
+        return [RobotView(40 * np.sin(t_s), 25 * np.cos(t_s), 1.0)]
+
+    return VirtualCamera(OPTICS, floor, robots, np.random.default_rng(seed), CameraSettings(**more))
+
+
+class LiveCamera:
+    """A camera that gives frames whether or not anyone can take them."""
+
+    name, size, rate_hz, dropped, live = "fake", SIZE, 30.0, 0, True
+
+    def __init__(self, frames, fails=False):
+        self.frames, self.fails, self.at = frames, fails, 0
+
+    async def start(self):
+        self.at = 0
+
+    async def next_frame(self):
+        await asyncio.sleep(0.002)
+        if self.at >= self.frames:
+            if self.fails:
+                raise CameraError("fake", "fake: the cable is out")
+            return None
+        self.at += 1
+        picture = np.full((SIZE[1] * 3 // 2, SIZE[0]), 40 + self.at, dtype=np.uint8)
+        return Frame(self.at - 1, self.at / 30.0, asyncio.get_running_loop().time(), picture)
+
+    async def stop(self):
+        self.at = self.frames
+
+
+async def until(condition):
+    """Wait on the real clock, at most 10 s."""
+    for _ in range(5000):
+        if condition():
+            return
+        await asyncio.sleep(0.002)
+    raise TimeoutError
+
+
+async def film(camera, folder, seconds, settings=None, **more):
+    """Film one segment after the other; their records, and every frame that the camera gave."""
+    given, closed = [], []
+    async with Recorder(camera, settings, on_frame=given.append, **more) as recorder:
+        for number, length_s in enumerate(seconds):
+            before = await recorder.open_segment(folder / f"{number}.mkv")
+            closed += [before] if before else []
+            await asyncio.sleep(length_s)
+        closed.append(await recorder.close_segment())
+    return closed, given
+
+
+def read(path):
+    with read_frames(path) as reader:
+        frames = list(reader)
+    return frames, reader.damage
+
+
+@pytest.mark.parametrize("codec", ["h264", "mjpeg"])
+@pytest.mark.parametrize("bit_rate", [None, 4_000_000])
+def test_rows_are_frames_and_pts_is_the_cameras_clock(tmp_path, codec, bit_rate):
+    settings = EncoderSettings(codec=codec, max_bit_rate=bit_rate)
+    camera = virtual_camera(drop_probability=0.05, clock_drift_ppm=300.0)
+    closed, given = run(film(camera, tmp_path, [2.0, 1.5, 3.0], settings), virtual=True)
+    assert sum(info.frames for info in closed) == len(given)
+    at = 0
+    for number, info in enumerate(closed):
+        frames, damage = read(info.path)
+        table = pd.read_parquet(frames_table(info.path))
+        mine = given[at : at + info.frames]
+        at += info.frames
+        assert damage is None
+        assert info.path == tmp_path / f"{number}.mkv"
+        assert info.codec == codec
+        assert len(frames) == len(table) == info.frames
+        assert list(table.columns) == ["frame", "index", "t_camera_s", "t_host_s", "dropped_before"]
+        assert table["frame"].tolist() == list(range(len(frames)))
+        assert table["index"].tolist() == [frame.index for frame in mine]
+        assert table["t_camera_s"].tolist() == [frame.t_camera_s for frame in mine]
+        assert table["t_host_s"].tolist() == [frame.t_host_s for frame in mine]
+        assert np.abs([f.t_s - m.t_camera_s for f, m in zip(frames, mine, strict=True)]).max() <= 0.001
+        assert (info.t_first_s, info.t_last_s) == (mine[0].t_camera_s, mine[-1].t_camera_s)
+        assert info.dropped == table["dropped_before"].sum()
+        for decoded, filmed in zip(frames, mine, strict=True):
+            assert np.abs(decoded.luma.astype(int) - filmed.luma).mean() < 4
+    # Nothing is lost between segments: every number is there, or counted as dropped.
+    assert sum(info.dropped for info in closed) == camera.dropped - given[0].index
+    assert given[-1].index + 1 == len(given) + camera.dropped
+
+
+def test_frames_lost_between_two_segments_are_counted_in_the_second(tmp_path):
+    class Skips(LiveCamera):
+        live = False
+
+        async def next_frame(self):
+            await asyncio.sleep(0.1)
+            self.at += 1
+            picture = np.full((SIZE[1] * 3 // 2, SIZE[0]), 100, dtype=np.uint8)
+            index = self.at if self.at <= 3 else self.at + 5
+            return Frame(index, index / 10.0, asyncio.get_running_loop().time(), picture)
+
+    (first, second), _ = run(film(Skips(100), tmp_path, [0.35, 0.3]), virtual=True)
+    assert (first.frames, first.dropped) == (3, 0)
+    assert (second.frames, second.dropped) == (3, 5)
+    assert pd.read_parquet(frames_table(second.path))["dropped_before"].tolist() == [5, 0, 0]
+
+
+def test_the_led_survives_the_encoder(tmp_path):
+    def truth(t_s):
+        return 40 * np.sin(t_s), 25 * np.cos(t_s)
+
+    optics = Pinhole.looking_down((640, 360), height_cm=205.0, field_width_cm=165.0)
+    camera = VirtualCamera(
+        optics,
+        lambda x, y, h: np.full(np.shape(x), 20.0),
+        lambda t_s: [RobotView(*truth(t_s), 1.0)],
+        np.random.default_rng(4),
+    )
+    [info], given = run(film(camera, tmp_path, [2.0]), virtual=True)
+    errors = []
+    for decoded, filmed in zip(read(info.path)[0], given, strict=True):
+        u, v = optics.project([(*truth(filmed.t_host_s), 7.3)])[0]
+        left, top = int(u) - 8, int(v) - 8
+        patch = decoded.luma[top : top + 17, left : left + 17].astype(float)
+        weight = np.clip(patch - 45.0, 0, None)
+        columns, rows = np.arange(left, left + 17), np.arange(top, top + 17)
+        errors.append([(weight.sum(0) @ columns) / weight.sum() - u, (weight.sum(1) @ rows) / weight.sum() - v])
+    assert np.sqrt(np.mean(np.square(errors))) < 0.25
+
+
+def test_a_file_has_its_name_only_when_it_is_whole(tmp_path):
+    async def main():
+        first, second = tmp_path / "a.mkv", tmp_path / "b.mkv"
+        async with Recorder(virtual_camera()) as recorder:
+            await recorder.open_segment(first)
+            assert recorder.segment == first
+            await asyncio.sleep(1.0)
+            assert not first.exists()
+            assert part_of(first).exists()
+            await recorder.open_segment(second)
+            assert first.exists()
+            assert frames_table(first).exists()
+            assert not part_of(first).exists()
+            await asyncio.sleep(1.0)
+            info = await recorder.stop()
+            assert info.path == second
+            assert info.frames > 25
+        assert sorted(path.name for path in tmp_path.iterdir()) == [
+            "a.frames.parquet",
+            "a.mkv",
+            "b.frames.parquet",
+            "b.mkv",
+        ]
+
+    run(main(), virtual=True)
+
+
+def test_two_runs_of_one_seed_are_the_same_files(tmp_path):
+    def once(name):
+        folder = tmp_path / name
+        folder.mkdir()
+        closed, _ = run(film(virtual_camera(7, drop_probability=0.1), folder, [1.0, 1.0]), virtual=True)
+        pictures = [frame.luma.tobytes() for info in closed for frame in read(info.path)[0]]
+        return pictures, [(info.frames, info.dropped, info.t_first_s) for info in closed]
+
+    assert once("a") == once("b")
+
+
+def test_a_killed_recorder_leaves_a_part_that_can_be_read(tmp_path):
+    script = textwrap.dedent("""
+        import os, signal, sys
+        from pathlib import Path
+        import numpy as np
+        from tracking.cameras import Frame
+        from tracking.segment import EncoderSettings, SegmentWriter
+
+        still = np.full((135, 160), 90, dtype=np.uint8)  # a few bytes a frame: nothing fills a buffer by itself
+        writer = SegmentWriter(Path(sys.argv[1]), EncoderSettings(), 30.0)
+        for number in range(150):
+            writer.add(Frame(number, number / 30.0, number / 30.0, still))
+        os.kill(os.getpid(), signal.SIGKILL)
+    """)
+    path = tmp_path / "v.mkv"
+    search = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    ended = subprocess.run([sys.executable, "-c", script, str(path)], env=search, timeout=60, check=False)
+    assert ended.returncode == -signal.SIGKILL
+    assert not path.exists()
+    frames, damage = read(part_of(path))
+    # At most the last second and the cluster before it are lost.
+    assert len(frames) >= 90
+    assert [frame.index for frame in frames] == list(range(len(frames)))
+    assert frames[-1].t_s == pytest.approx((len(frames) - 1) / 30.0, abs=0.001)
+    assert "never closed" in damage
+
+
+def test_a_segment_cut_short_still_gives_most_of_its_frames(tmp_path):
+    [info], _ = run(film(virtual_camera(drop_probability=0.0), tmp_path, [10.0]), virtual=True)
+    data = info.path.read_bytes()
+    cut = tmp_path / "cut.mkv"
+    cut.write_bytes(data[: int(len(data) * 0.8)])
+    frames, damage = read(cut)
+    assert 200 < len(frames) < 260
+    assert damage is not None
+
+
+def test_a_live_camera_drops_and_counts_when_the_encoder_is_behind(tmp_path, monkeypatch):
+    gate = threading.Event()
+    add = SegmentWriter.add
+
+    def slow(self, frame):
+        gate.wait(10.0)
+        add(self, frame)
+
+    monkeypatch.setattr(SegmentWriter, "add", slow)
+    camera = LiveCamera(40)
+
+    async def main():
+        async with Recorder(camera, queue_frames=4) as recorder:
+            await recorder.open_segment(tmp_path / "v.mkv")
+            await until(lambda: camera.at >= 35)
+            gate.set()
+            await until(lambda: camera.at >= 40)
+            await asyncio.sleep(0.05)
+            return await recorder.close_segment(), recorder.dropped
+
+    info, dropped = run(main(), virtual=False)
+    table = pd.read_parquet(frames_table(info.path))
+    assert dropped >= 25
+    # Frames lost after the last one that was written cannot stand before any.
+    assert info.frames + dropped == 40
+    assert table["dropped_before"].sum() == table["index"].iloc[-1] + 1 - info.frames == info.dropped
+    assert len(read(info.path)[0]) == info.frames
+
+
+def test_orders_wait_for_room_even_when_frames_do_not(tmp_path, monkeypatch):
+    add = SegmentWriter.add
+
+    def slow(self, frame):
+        time.sleep(0.03)
+        add(self, frame)
+
+    monkeypatch.setattr(SegmentWriter, "add", slow)
+
+    async def main():
+        async with Recorder(LiveCamera(30), queue_frames=1) as recorder:
+            await recorder.open_segment(tmp_path / "a.mkv")
+            await asyncio.sleep(0.03)
+            first = await recorder.open_segment(tmp_path / "b.mkv")
+            await asyncio.sleep(0.03)
+            return first, await recorder.close_segment()
+
+    first, second = run(main(), virtual=False)
+    assert first.frames > 0
+    assert (tmp_path / "a.mkv").exists()
+    assert second.path == tmp_path / "b.mkv"
+
+
+def test_a_virtual_camera_waits_for_a_slow_encoder(tmp_path, monkeypatch):
+    add = SegmentWriter.add
+
+    def slow(self, frame):
+        time.sleep(0.004)
+        add(self, frame)
+
+    monkeypatch.setattr(SegmentWriter, "add", slow)
+    camera = virtual_camera(drop_probability=0.0)
+    [info], given = run(film(camera, tmp_path, [3.0], queue_frames=2), virtual=True)
+    assert info.frames == len(given) in range(88, 91)
+    assert info.dropped == camera.dropped == 0
+
+
+def test_a_broken_segment_is_told_at_its_close_and_the_next_one_works(tmp_path, monkeypatch):
+    add = SegmentWriter.add
+
+    def full(self, frame):
+        if self.path.name == "0.mkv" and frame.index > 10:
+            raise OSError(28, "No space left on device")
+        add(self, frame)
+
+    monkeypatch.setattr(SegmentWriter, "add", full)
+
+    async def main():
+        async with Recorder(virtual_camera()) as recorder:
+            await recorder.open_segment(tmp_path / "0.mkv")
+            await asyncio.sleep(1.0)
+            with pytest.raises(RecorderError, match="No space left") as caught:
+                await recorder.open_segment(tmp_path / "1.mkv")
+            assert caught.value.path == tmp_path / "0.mkv"
+            assert caught.value.exit_code == 1
+            await asyncio.sleep(1.0)
+            return await recorder.close_segment()
+
+    info = run(main(), virtual=True)
+    assert info.path == tmp_path / "1.mkv"
+    assert len(read(info.path)[0]) == info.frames > 25
+    # What was written of the broken one is kept for `recover`.
+    assert part_of(tmp_path / "0.mkv").exists()
+    assert not (tmp_path / "0.mkv").exists()
+
+
+def test_a_close_that_fails_is_told(tmp_path, monkeypatch):
+    async def main():
+        async with Recorder(virtual_camera()) as recorder:
+            await recorder.open_segment(tmp_path / "v.mkv")
+            await asyncio.sleep(0.5)
+            monkeypatch.setattr(segment, "_publish", lambda *paths: (_ for _ in ()).throw(OSError(5, "I/O error")))
+            with pytest.raises(RecorderError, match="I/O error"):
+                await recorder.close_segment()
+
+    run(main(), virtual=True)
+    assert not (tmp_path / "v.mkv").exists()
+    assert part_of(tmp_path / "v.mkv").exists()
+
+
+def test_a_camera_that_fails_is_told_and_its_frames_are_kept(tmp_path):
+    async def main():
+        async with Recorder(LiveCamera(20, fails=True)) as recorder:
+            await recorder.open_segment(tmp_path / "v.mkv")
+            await until(lambda: recorder.failure is not None)
+            info = await recorder.close_segment()
+            assert info.frames == 20
+            with pytest.raises(RecorderError, match="cable is out"):
+                await recorder.open_segment(tmp_path / "w.mkv")
+
+    run(main(), virtual=False)
+    assert len(read(tmp_path / "v.mkv")[0]) == 20
+
+
+def test_an_error_in_whoever_listens_is_not_lost(tmp_path):
+    def listen(frame):
+        raise ValueError("the live page fell over")
+
+    async def main():
+        async with Recorder(virtual_camera(), on_frame=listen) as recorder:
+            await asyncio.sleep(0.5)
+            with pytest.raises(RecorderError, match="fell over"):
+                await recorder.open_segment(tmp_path / "v.mkv")
+
+    run(main(), virtual=True)
+
+
+def test_a_segment_without_frames_leaves_no_file(tmp_path):
+    async def main():
+        async with Recorder(virtual_camera()) as recorder:
+            await recorder.open_segment(tmp_path / "v.mkv")
+            info = await recorder.close_segment()
+            assert recorder.latest is None
+            await asyncio.sleep(0.2)
+            assert recorder.latest.index > 3
+            return info
+
+    info = run(main(), virtual=True)
+    assert info.frames == info.dropped == 0
+    assert np.isnan(info.t_first_s)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_wrong_requests_are_told(tmp_path):
+    (tmp_path / "there.mkv").touch()
+
+    async def main():
+        recorder = Recorder(virtual_camera())
+        assert await recorder.stop() is None
+        with pytest.raises(RecorderError, match="start it first"):
+            await recorder.open_segment(tmp_path / "v.mkv")
+        async with recorder:
+            with pytest.raises(RequestError, match="no such folder"):
+                await recorder.open_segment(tmp_path / "none" / "v.mkv")
+            with pytest.raises(RequestError, match="there already"):
+                await recorder.open_segment(tmp_path / "there.mkv")
+            with pytest.raises(RecorderError, match="no video segment is open"):
+                await recorder.close_segment()
+
+    run(main(), virtual=True)
+    with pytest.raises(RequestError, match="not known"):
+        EncoderSettings(codec="av1")
+
+
+def test_an_encoder_that_hangs_is_given_up(tmp_path, monkeypatch):
+    gate = threading.Event()
+    monkeypatch.setattr(SegmentWriter, "add", lambda self, frame: gate.wait(10.0))
+
+    async def main():
+        recorder = Recorder(virtual_camera(), queue_frames=1, timeout_s=0.1)
+        await recorder.start()
+        await recorder.open_segment(tmp_path / "v.mkv")
+        await asyncio.sleep(1.0)
+        assert "took nothing" in str(recorder.failure)
+        with pytest.raises(RecorderError, match="encoder"):
+            await recorder.close_segment()
+        gate.set()
+        assert (await recorder.stop()).path == tmp_path / "v.mkv"
+
+    run(main(), virtual=True)
+
+
+def test_without_h264_auto_takes_motion_jpeg(monkeypatch):
+    assert EncoderSettings().encoder() == "h264"
+
+    def missing(name, mode):
+        raise UnknownCodecError(name)
+
+    monkeypatch.setattr(segment.av, "Codec", missing)
+    assert EncoderSettings().encoder() == "mjpeg"
+    with pytest.raises(RequestError, match="no H"):
+        EncoderSettings(codec="h264").encoder()
