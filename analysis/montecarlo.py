@@ -144,8 +144,11 @@ def simulate_lines(
     """Give (k, 𝓛_1 in cm, 𝓛_3 in cm³), each (lines,), of random crossing lines."""
     _at_least_one(lines=lines)
     parts = list(_blocks(Boundary.of(geometry), lines, rng, Lines.invariants, threads=threads))
-    k, l1_cm, l3_cm3 = ([part[column] for part in parts] for column in range(3))
-    return np.concatenate(k), np.concatenate(l1_cm), np.concatenate(l3_cm3)
+    return (
+        np.concatenate([k for k, _, _ in parts]),
+        np.concatenate([l1_cm for _, l1_cm, _ in parts]),
+        np.concatenate([l3_cm3 for _, _, l3_cm3 in parts]),
+    )
 
 
 def simulate_crossings(
@@ -209,7 +212,7 @@ def _segment_sums(
     first = 0
 
     def invariants(block: Lines) -> Floats:
-        return np.column_stack(block.invariants())
+        return np.column_stack([np.asarray(column, dtype=float) for column in block.invariants()])
 
     for values in _blocks(boundary, int(ends[-1]), rng, invariants, threads=threads, progress=progress):
         last = first + len(values)

@@ -77,7 +77,7 @@ async def open_bench(settings: Settings, shape: Shape, seed: np.random.SeedSeque
     """
     check_fits(shape, settings.arena.polygon, SHAPE_MARGIN_CM)
     optics = settings.projector_optics.pinhole()
-    profile = RobotProfile()
+    profile = RobotProfile(cm_s_per_unit=settings.motion.cm_s_per_unit)
     async with AsyncExitStack() as stack:
         if settings.is_virtual:
             world = await stack.enter_async_context(virtual_world(settings, seed, profile))

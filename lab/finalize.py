@@ -13,6 +13,7 @@ from lab.store import SessionFolderError, SessionReader
 LINE_COLUMNS = {
     "line": "int64",
     "t_start_s": "float64",
+    "t_rolling_s": "float64",
     "t_end_s": "float64",
     "length_cm": "float64",
     "speed_cm_s": "float64",

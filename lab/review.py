@@ -12,8 +12,8 @@ import pandas as pd
 from shapely import Polygon
 from shapely.geometry import shape as shape_of
 
-from analysis.estimate import Estimate, estimate, relative_covariance
-from analysis.figures.values import Band, Entry, Isotropy, Measured
+from analysis.estimate import Estimate, estimate
+from analysis.figures.values import Band, Entry, Isotropy
 from analysis.invariants import invariants_table
 from analysis.montecarlo import running_bands
 from analysis.quadrature import Moments
@@ -226,8 +226,8 @@ def to_result(found: Reviewed, host: Mapping[str, Any] | None = None) -> Session
         lines=found.tables.lines[found.tables.lines["counts"]],
         crossings=found.tables.crossings,
         estimates=found.tables.estimates,
-        exact=_entry(found.titles[name], found.moments[name]),
-        dictionary={key: _entry(found.titles[key], moments) for key, moments in found.moments.items()},
+        exact=Entry.of(found.titles[name], found.moments[name]),
+        dictionary={key: Entry.of(found.titles[key], moments) for key, moments in found.moments.items()},
         ranking=found.ranking,
         stop_at=found.settings.stop.until or 0.95,
         posteriors=found.posteriors,
@@ -235,7 +235,7 @@ def to_result(found: Reviewed, host: Mapping[str, Any] | None = None) -> Session
         track=filmed.track if filmed else None,
         true_lines=filmed.lines if filmed else None,
         true_crossings=filmed.crossings if filmed else None,
-        camera=_measured(filmed.estimate) if filmed else None,
+        camera=filmed.estimate if filmed else None,
         chord_pairs=filmed.match.pairs if filmed else None,
         chords_missed=filmed.match.missed if filmed else None,
         chords_extra=filmed.match.extra if filmed else None,
@@ -258,22 +258,11 @@ def to_result(found: Reviewed, host: Mapping[str, Any] | None = None) -> Session
     )
 
 
-def _entry(title: str, moments: Moments) -> Entry:
-    size = np.array([moments.area_cm2, moments.perimeter_cm])
-    relative = relative_covariance(moments.mean, moments.covariance)
-    return Entry(title, moments.area_cm2, moments.perimeter_cm, relative * np.outer(size, size))
-
-
-def _measured(found: Estimate | None) -> Measured | None:
-    return None if found is None else Measured(found.n, found.area_cm2, found.perimeter_cm, found.covariance)
-
-
 def _band(geometry: Silhouette, lines: int, seed: int) -> Band | None:
     if lines < 2:
         return None
     checkpoints = np.unique(np.geomspace(2, lines, _BAND_POINTS).round().astype(np.int64))
-    bands = running_bands(geometry, checkpoints, _BAND_RUNS, np.random.default_rng(seed))
-    return Band(bands.n, bands.quantile_levels, bands.area_quantiles_cm2, bands.perimeter_quantiles_cm, _BAND_RUNS)
+    return Band.of(running_bands(geometry, checkpoints, _BAND_RUNS, np.random.default_rng(seed)))
 
 
 def _isotropy(filmed: Filmed, reachable: Polygon) -> Isotropy | None:

@@ -86,17 +86,26 @@ class _Run:
     samples: list[Sample] = field(default_factory=list[Sample])
     crossings: list[Crossing] = field(default_factory=list[Crossing])
     rolled_cm: float = 0.0
+    t_rolling_s: float | None = None
     moved_s: float = 0.0
     moved_cm: float = 0.0
 
     def path_cm(self, t_s: float) -> float:
-        """Distance along the run: elapsed time × speed, or what the wheels counted up to the last sample."""
-        return self.rolled_cm if self.by_odometry else self.speed_cm_s * (t_s - self.t_start_s)
+        """Distance along the run: time since it rolls × speed, or what the wheels counted up to the last sample."""
+        if self.by_odometry:
+            return self.rolled_cm
+        return self.speed_cm_s * (t_s - self.t_rolling_s) if self.t_rolling_s is not None else 0.0
 
     def feed(self, sample: Sample) -> None:
         if self.samples:
             last = self.samples[-1]
             self.rolled_cm += math.hypot(sample.x_cm - last.x_cm, sample.y_cm - last.y_cm)
+            half_cm_s = self.speed_cm_s / 2
+            if self.t_rolling_s is None and last.speed_cm_s < half_cm_s <= sample.speed_cm_s:
+                # A ball that gathers speed evenly is, once at full speed, where it would be had it started at
+                # full speed at the moment when it passed half of it.
+                part = (half_cm_s - last.speed_cm_s) / (sample.speed_cm_s - last.speed_cm_s)
+                self.t_rolling_s = last.t_host_s + part * (sample.t_host_s - last.t_host_s)
         else:
             self.moved_s = sample.t_host_s
         if self.rolled_cm > self.moved_cm + _STALL_CM:
@@ -279,6 +288,7 @@ class Session:
         record: dict[str, Any] = {
             "line": run.line,
             "t_start_s": run.t_start_s,
+            "t_rolling_s": run.t_rolling_s,
             "t_end_s": t_end_s,
             "length_cm": run.rolled_cm,
             "speed_cm_s": run.rolled_cm / (t_end_s - run.t_start_s) if t_end_s > run.t_start_s else 0.0,

@@ -63,6 +63,8 @@ class MotionSettings(_Section):
     """Cruising speed. The paper rolls at 1 cm/s; at most 150 cm/s."""
     turning: Literal["lambert", "uniform"] = "lambert"
     """How it turns at the wall: `lambert` (cosine law: isotropic uniform lines) or `uniform` (biased, to show it)."""
+    cm_s_per_unit: Annotated[float, Field(gt=0, le=10)] = 0.59
+    """Speed of one unit of the drive command's speed byte on this floor; from chord lengths against the camera's."""
     run_timeout_s: Positive = 60.0
     """A run without a bump for this long is given up: the robot is stuck or lifted."""
     length_from: Literal["time", "odometry"] = "time"

@@ -25,9 +25,10 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """The virtual devices, wired to each other."""
+    """The virtual devices, wired to each other; ``radio`` is the air that the robot advertises in."""
 
     robot: Bolt
+    radio: VirtualRadio
     projector: VirtualProjector
     camera: VirtualCamera | None
     body: Body
@@ -35,9 +36,13 @@ class World:
 
 @asynccontextmanager
 async def virtual_world(
-    settings: Settings, seed: np.random.SeedSequence, profile: RobotProfile
+    settings: Settings, seed: np.random.SeedSequence, profile: RobotProfile, *, name: str = ROBOT_NAME
 ) -> AsyncGenerator[World]:
-    """Make the virtual bench that ``settings`` describe; everything random in it follows from ``seed``."""
+    """Make the virtual bench that ``settings`` describe; everything random in it follows from ``seed``.
+
+    Raises:
+        RequestError: ``name`` is not a BOLT's.
+    """
     body_rng, camera_rng = (np.random.default_rng(child) for child in seed.spawn(2))
     physics = settings.virtual
     projector = VirtualProjector(
@@ -90,13 +95,11 @@ async def virtual_world(
     radio = VirtualRadio()
     await radio.start()
     try:
-        twin = VirtualBolt(radio, body, ROBOT_NAME)
+        twin = VirtualBolt(radio, body, name)
         await twin.start()
         try:
-            robot = Bolt(
-                ROBOT_NAME, backend=radio.client_backend, scanner_backend=radio.scanner_backend, profile=profile
-            )
-            yield World(robot, projector, camera, body)
+            robot = Bolt(name, backend=radio.client_backend, scanner_backend=radio.scanner_backend, profile=profile)
+            yield World(robot, radio, projector, camera, body)
         finally:
             await twin.close()
     finally:

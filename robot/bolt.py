@@ -32,6 +32,9 @@ _COLLISION = commands.COLLISION.key
 _CM_PER_M = 100.0
 _COLLISION_METHOD = 1
 _FAREWELL_TIMEOUT_S = 2.0
+# Who waits for a deadline sleeps at least this long, far above what an event loop may wake it early by: else
+# it could find the deadline a rounding ahead for ever, in turns that take no virtual time.
+_LEAST_NAP_S = 0.001
 
 
 class Bolt:
@@ -263,18 +266,18 @@ class Bolt:
         """Repeat the drive command and keep the robot awake."""
         profile = self.profile
         while self._link.is_open:
-            ping_at_s = self._link.last_write_s + profile.keep_alive_s
             try:
                 if self._now_s() >= self._refresh_at_s:
                     await self._repeat()
-                elif self._now_s() >= ping_at_s:
+                elif self._now_s() >= self._link.last_write_s + profile.keep_alive_s:
                     await self._link.ask(Request(commands.PING))
             except RobotError as error:
                 self._link.fail(str(error))
                 return
+            next_s = min(self._link.last_write_s + profile.keep_alive_s, self._refresh_at_s)
             # At most half a refresh, so that a drive begun meanwhile is seen in time.
-            next_s = min(ping_at_s, self._refresh_at_s, self._now_s() + profile.refresh_s / 2)
-            await asyncio.sleep(max(0.0, next_s - self._now_s()))
+            nap_s = min(next_s - self._now_s(), profile.refresh_s / 2)
+            await asyncio.sleep(max(_LEAST_NAP_S, nap_s))
 
     async def _watch(self) -> None:
         """Take a link whose stream has fallen silent for lost."""
@@ -284,7 +287,7 @@ class Bolt:
             if self._now_s() >= quiet_at_s:
                 self._link.fail(f"no sample for {silence_s:g} s")
                 return
-            await asyncio.sleep(min(silence_s / 2, quiet_at_s - self._now_s()))
+            await asyncio.sleep(max(_LEAST_NAP_S, min(silence_s / 2, quiet_at_s - self._now_s())))
 
     async def _repeat(self) -> None:
         """Send the drive command once more, unless a newer one is on its way."""

@@ -20,7 +20,7 @@ DEFAULT_LED_HEIGHT_CM = 7.3
 class CalibrationError(RequestError):
     """A calibration is missing, garbled or belongs to another camera. ``path``: the file, where there is one.
 
-    Mend it with `chordlab calibrate camera`.
+    Mend the file, or measure the camera's pose anew.
     """
 
     def __init__(self, message: str, path: Path | None = None) -> None:
@@ -102,12 +102,12 @@ def load_calibration(path: str | Path) -> Calibration:
         data: Any = json.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
         raise CalibrationError(
-            f"{file}: cannot read the calibration ({error.strerror}); run `chordlab calibrate camera`", file
+            f"{file}: cannot read the calibration ({error.strerror}); check the path", file
         ) from error
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise CalibrationError(f"{file}: not a JSON file; run `chordlab calibrate camera` again", file) from error
+        raise CalibrationError(f"{file}: not a JSON file; give a calibration.json", file) from error
     if not isinstance(data, dict):
-        raise CalibrationError(f"{file}: a calibration is one JSON object; run `chordlab calibrate camera` again", file)
+        raise CalibrationError(f"{file}: a calibration is one JSON object; give a calibration.json", file)
     try:
         return Calibration.from_dict(cast("dict[str, Any]", data))
     except RequestError as error:

@@ -19,13 +19,15 @@ Floats = NDArray[np.float64]
 class Agreement:
     """Robot minus camera over matched chords: mean and sd in cm, and the limits of agreement (mean ± 1.96 sd).
 
-    ``scale`` is Σ robot · camera / Σ camera², the slope through the origin. Source: Bland and Altman, Lancet 1986.
+    ``scale`` is Σ robot · camera / Σ camera², the slope through the origin, and ``scale_sigma`` its standard error.
+    Source: Bland and Altman, Lancet 1986.
     """
 
     chords: int
     bias_cm: float
     sd_cm: float
     scale: float
+    scale_sigma: float
 
     @property
     def limits_cm(self) -> tuple[float, float]:
@@ -39,11 +41,15 @@ def agreement(chord_pairs: pd.DataFrame) -> Agreement | None:
     if robot.size < 2:
         return None
     difference = robot - camera
+    weight = float(camera @ camera)
+    scale = float(robot @ camera) / weight
+    rest = robot - scale * camera
     return Agreement(
         chords=robot.size,
         bias_cm=float(difference.mean()),
         sd_cm=float(difference.std(ddof=1)),
-        scale=float(robot @ camera / (camera @ camera)),
+        scale=scale,
+        scale_sigma=float(np.sqrt(rest @ rest / (robot.size - 1) / weight)),
     )
 
 

@@ -183,6 +183,7 @@ def dots(
     pixels: bool = False,
 ) -> None:
     """Draw points of ``size`` points²; ``pixels``: as an image in an SVG, for many."""
+    bare = marker in {"x", "+"}  # strokes without a face, which matplotlib colours as faces
     axes.scatter(
         np.asarray(x, dtype=float),
         np.asarray(y, dtype=float),
@@ -190,8 +191,8 @@ def dots(
         c=colour,
         alpha=alpha,
         marker=marker,
-        linewidths=0.0 if edge is None else 0.9,
-        edgecolors="none" if edge is None else edge,
+        linewidths=1.6 if bare else 0.9 if edge else 0.0,
+        edgecolors=None if bare else edge or "none",
         zorder=above,
         label=label,
         gid=gid,
@@ -343,9 +344,9 @@ def text(
 def spread_labels(axes: Axes, contours: Sequence[Floats], words: Sequence[str], colours: Sequence[str]) -> list[str]:
     """Name regions that are given by their convex contours (m, 2) in data units.
 
-    Each label goes beside its region's outermost point in the first of eight directions, near or a little further
-    off, where it covers no label, no region and no edge. Labels that find no such place are left out: an unreadable
-    heap names nothing. Returns the words written.
+    Each label goes beside its region's outermost point in the first of eight directions, those that lead away from
+    the other regions first, near or a little further off, where it covers no label, no region and no edge. Labels that
+    find no such place are left out: an unreadable heap names nothing. Returns the words written.
     """
     figure = axes.get_figure(root=True)
     if figure is None:
@@ -355,12 +356,17 @@ def spread_labels(axes: Axes, contours: Sequence[Floats], words: Sequence[str], 
     point = figure.dpi / 72
     edge = axes.get_window_extent()
     page = box(edge.x0, edge.y0, edge.x1, edge.y1)
+    middle = np.mean([region.centroid.coords[0] for region in regions], axis=0) if regions else np.zeros(2)
     labels: list[Polygon] = []
     written: list[str] = []
     for index, word in enumerate(words):
         corners = np.asarray(regions[index].exterior.coords)
         half = np.array([0.29 * len(word) + 0.2, 0.62]) * SMALL_SIZE * point
-        for gap, way in ((gap, np.array(way)) for gap in (3, 10) for way in _WAYS):
+        outwards: Floats = corners.mean(axis=0) - middle
+        away = [float(outwards @ np.array(way)) / float(np.hypot(*way)) for way in _WAYS]
+        ranked = sorted((-round(share, 6), rank) for rank, share in enumerate(away))
+        ways = [np.array(_WAYS[rank], dtype=float) for _, rank in ranked]
+        for gap, way in ((gap, way) for gap in (3, 10) for way in ways):
             outermost = int(np.argmax(corners @ way))
             centre = corners[outermost] + (half + gap * point) * way
             (west, south), (east, north) = (centre - half).tolist(), (centre + half).tolist()

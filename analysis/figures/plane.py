@@ -67,7 +67,7 @@ def plane_figure(
     if camera is not None:
         place = np.array([[camera.perimeter_cm, camera.area_cm2]])
         corners.append(place)
-        pen.dots(axes, place[:, 0], place[:, 1], pen.INK, marker="X", size=60, edge=pen.PAPER, label="camera", above=5)
+        pen.dots(axes, place[:, 0], place[:, 1], pen.INK, marker="x", size=70, label="camera", above=5)
     _limits(axes, np.concatenate(corners) if corners else np.empty((0, 2)))
     pen.line(axes, [], [], pen.MUTED, width=1.6, label="robot, as N grows")
     pen.dots(axes, [], [], pen.PAPER, edge=pen.INK, size=38, label="robot, last")

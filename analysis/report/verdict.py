@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.estimate import Estimate
-from analysis.figures.camera import agreement
+from analysis.figures.camera import Agreement, agreement
 from analysis.figures.values import Entry
 from analysis.report.result import SessionResult
 from analysis.report.words import count, number, p_value, percent, plus_minus, probability, signed
@@ -119,7 +119,7 @@ def verdict_of(result: SessionResult) -> Verdict:
                 Problem(
                     "The robot reported no line with a lit stretch.",
                     "Check that the projector shows the shape, that the robot rolls inside the arena, and that its "
-                    "light levels separate (`chordlab calibrate robot`).",
+                    "light levels separate (`levels` in manifest.json).",
                 ),
             ),
         )
@@ -237,7 +237,7 @@ def _of_the_recognition(result: SessionResult, measured: Estimate) -> list[Probl
         problems.append(
             Problem(
                 f"Only {count(measured.n, 'line')} crossed the shape; below {FEW_LINES} the uncertainties are rough.",
-                f"Roll on to at least {FEW_LINES} crossing lines (`chordlab run --resume`).",
+                f"Roll at least {FEW_LINES} crossing lines (`chordlab run --lines {FEW_LINES}`).",
             )
         )
     return problems
@@ -252,7 +252,7 @@ def _undecided(result: SessionResult, measured: Estimate, rival: str, needed: fl
         )
     lines = round(needed, -int(np.floor(np.log10(max(needed, 1.0)))) + 1)
     if needed > measured.n:
-        step = f"By theory about {lines:.0f} crossing lines settle it: roll on (`chordlab run --resume`)."
+        step = f"By theory about {lines:.0f} crossing lines settle it: `chordlab run --lines {lines:.0f}`."
     else:
         step = (
             f"By theory about {lines:.0f} lines suffice: the measurement is biased rather than short. Calibrate the "
@@ -269,31 +269,49 @@ def _of_the_sizes(result: SessionResult, measured: Estimate) -> list[Problem]:
         problems.append(
             Problem(
                 f"A and P deviate more than chance allows (p {p_value(off.chance)}).",
-                "A deviates about twice as much as P, as a wrong speed or scale makes it: `chordlab calibrate robot`, "
-                "then check the projector's plane."
+                "A deviates about twice as much as P, as a wrong speed or scale makes it: check `motion.cm_s_per_unit` "
+                "in the settings, then the projector's height."
                 if stretched
                 else "Check the light threshold, the sensor's footprint and lost short chords; a slower robot or "
                 "faster sampling mends the latter.",
             )
         )
     found = None if result.chord_pairs is None else agreement(result.chord_pairs)
-    if found is not None and abs(found.scale - 1) > SCALE_TOLERANCE:
+    if found is not None:
+        problems += _of_the_chords(found, result.chords_missed or 0, result.chords_extra or 0)
+    return problems
+
+
+def _of_the_chords(found: Agreement, missed: int, extra: int) -> list[Problem]:
+    problems: list[Problem] = []
+    off = found.scale - 1
+    if abs(off) > max(SCALE_TOLERANCE, 3 * found.scale_sigma):
         problems.append(
             Problem(
-                f"The robot's lengths are {signed(100 * (found.scale - 1))} % off the camera's; that puts "
+                f"The robot's lengths are {signed(100 * off)} % off the camera's; that puts "
                 f"{signed(100 * (found.scale**2 - 1))} % on A.",
-                "Calibrate the robot's speed (`chordlab calibrate robot`), or check the camera's calibration.",
+                f"Divide `motion.cm_s_per_unit` in the settings by {found.scale:.3f}, or check the camera's calibration.",
             )
         )
-    if found is not None and result.chords_missed:
-        missed = result.chords_missed / (found.chords + result.chords_missed)
-        if missed > MISSED_TOLERANCE:
-            problems.append(
-                Problem(
-                    f"The robot missed {percent(missed)} of the chords, which lowers P.",
-                    "Lower the speed or shorten the sampling interval: chords shorter than one step are lost.",
-                )
+    share = missed / (found.chords + missed)
+    if share <= MISSED_TOLERANCE:
+        return problems
+    if extra > missed / 2:
+        problems.append(
+            Problem(
+                f"{percent(share)} of the camera's chords found no partner among the robot's, nor {extra} of the "
+                "robot's among the camera's.",
+                "As many on either side: the chords were made but not matched. Check the camera's calibration and that "
+                "robot and camera agree on where each run begins.",
             )
+        )
+    else:
+        problems.append(
+            Problem(
+                f"The robot missed {percent(share)} of the chords, which lowers P.",
+                "Lower the speed or shorten the sampling interval: chords shorter than one step are lost.",
+            )
+        )
     return problems
 
 

@@ -44,9 +44,9 @@ def percent(share: float, digits: int = 1) -> str:
 
 def probability(value: float) -> str:
     """Write a probability in per cent with one decimal, never rounded to certainty or to impossibility."""
-    if value > 0.9995:
+    if value > 0.999:
         return "more than 99.9 %"
-    if value < 0.0005:
+    if value < 0.001:
         return "less than 0.1 %"
     return percent(value)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import AsyncGenerator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict
 from itertools import pairwise
 from typing import Annotated
@@ -13,31 +13,49 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from lab.base.errors import RequestError
+from lab.bench import SHAPE_MARGIN_CM
 from lab.cli.output import JsonFlag, emit, say, show_table
 from lab.clock import run
 from lab.settings import load_settings
 from lab.world import virtual_world
-from robot.bolt import Bolt, scan
+from projector.dictionary import shape_from
+from projector.render import render
+from projector.shape import check_fits
+from robot.bolt import Bolt, Heard, scan
 from robot.device import Sample
 from robot.profile import RobotProfile
+from robot.virtual.bolt import address_of
+from robot.virtual.hci_client import HciRadio
+from robot.virtual.hci_server import DEFAULT_ENDPOINT, HciServer, parse_endpoint
 
 app = typer.Typer(help="The robot alone: find it, ask it, drive it.", no_args_is_help=True)
 
 NameArgument = Annotated[
     str, typer.Argument(metavar="NAME", help="The advertised name, such as SB-1234, or `virtual`.")
 ]
+HciOption = Annotated[
+    str | None,
+    typer.Option("--hci", metavar="HOST:PORT", help="Look in the air that `chordlab robot virtual` serves there."),
+]
 
 
 @app.command("scan")
 def scan_robots(
     seconds: Annotated[float, typer.Option(min=0.5, max=120, help="How long to listen.")] = 5.0,
+    hci: HciOption = None,
     as_json: JsonFlag = False,
 ) -> None:
     """List the robots in range.
 
     Example: chordlab robot scan --seconds 5
     """
-    heard = run(scan(seconds), virtual=False)
+
+    async def listen() -> list[Heard]:
+        async with _air(hci) as radio:
+            return await scan(seconds, radio.scanner_backend if radio is not None else None)
+
+    heard = run(listen(), virtual=False)
     if as_json:
         emit({"robots": [asdict(robot) for robot in heard]})
     elif heard:
@@ -48,14 +66,14 @@ def scan_robots(
 
 
 @app.command("info")
-def info(name: NameArgument, as_json: JsonFlag = False) -> None:
+def info(name: NameArgument, hci: HciOption = None, as_json: JsonFlag = False) -> None:
     """Connect, and print firmware, address and battery.
 
     Example: chordlab robot info virtual
     """
 
     async def ask() -> dict[str, object]:
-        async with _connected(name) as robot:
+        async with _connected(name, hci) as robot:
             return asdict(await robot.identity())
 
     identity = run(ask(), virtual=name == "virtual")
@@ -72,6 +90,7 @@ def drive(
     heading: Annotated[float, typer.Option(min=-360, max=360, help="Degrees, clockwise from where it faces.")] = 0.0,
     speed: Annotated[float, typer.Option(min=1, max=150, help="cm/s.")] = 25.0,
     seconds: Annotated[float, typer.Option(min=0.1, max=60, help="How long.")] = 1.0,
+    hci: HciOption = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Roll straight for a while and stop; says how far it got by its own odometer.
@@ -82,7 +101,7 @@ def drive(
     bumps: list[float] = []
 
     async def roll() -> None:
-        async with _connected(name) as robot:
+        async with _connected(name, hci) as robot:
             robot.on_sample = track.append
             robot.on_bump = lambda bump: bumps.append(bump.normal_heading_rad)
             await robot.start_stream(0.05)
@@ -100,17 +119,87 @@ def drive(
         say(f"rolled {rolled_cm:.1f} cm, {len(track)} light samples, mean {light:.0f} lux, {len(bumps)} bumps")
 
 
+@app.command("virtual")
+def virtual(
+    hci: Annotated[
+        str, typer.Option("--hci", metavar="HOST:PORT", help="Where to serve; port 0 takes any that is free.")
+    ] = DEFAULT_ENDPOINT,
+    name: Annotated[str, typer.Option(help="The robot's name: SB- and four hexadecimal digits.")] = "SB-1234",
+    seconds: Annotated[float | None, typer.Option(min=0.1, help="Stop after this long; none: at Ctrl-C.")] = None,
+    shape: Annotated[
+        str | None, typer.Option(metavar="SHAPE", help="What is projected on its arena; none: a dark floor.")
+    ] = None,
+    allow_remote: Annotated[
+        bool, typer.Option("--allow-remote", help="Allow a HOST that other machines reach; HCI knows no password.")
+    ] = False,
+    as_json: JsonFlag = False,
+) -> None:
+    """Serve a virtual BOLT, in real time, to Bluetooth clients in other processes: HCI over TCP.
+
+    Example: chordlab robot virtual --shape eiffel --name SB-1234
+    """
+    host, port = parse_endpoint(hci)
+    address = address_of(name)
+    drawn = shape_from(shape) if shape is not None else None
+    settings = load_settings(None, {"camera": "none"})
+    if drawn is not None:
+        check_fits(drawn, settings.arena.polygon, SHAPE_MARGIN_CM)
+
+    async def serve() -> None:
+        seed = np.random.SeedSequence(settings.seed)
+        async with virtual_world(settings, seed, RobotProfile(), name=name) as world:
+            if drawn is not None:
+                optics = settings.projector_optics.pinhole()
+                world.projector.show(render(drawn.geometry, optics, settings.sensor.height_cm))
+            server = HciServer(world.radio, host, port, anywhere=allow_remote)
+            await server.start()
+            try:
+                if as_json:
+                    served = {"name": name, "address": address, "hci": server.endpoint, "port": server.port}
+                    emit({**served, "shape": shape})
+                else:
+                    say(f"{name} ({address}) advertises at {server.endpoint}, HCI over TCP")
+                async with asyncio.timeout(seconds):
+                    await asyncio.Event().wait()
+            except TimeoutError:
+                return
+            finally:
+                await server.close()
+
+    # Ctrl-C is how this is meant to end.
+    with suppress(KeyboardInterrupt):
+        run(serve(), virtual=False)
+
+
 @asynccontextmanager
-async def _connected(name: str) -> AsyncGenerator[Bolt]:
-    """A connected robot, real or virtual; stopped and let go on every way out."""
+async def _air(hci: str | None) -> AsyncGenerator[HciRadio | None]:
+    """The served air at ``hci``; None is the real one."""
+    if hci is None:
+        yield None
+        return
+    radio = HciRadio(hci)
+    await radio.start()
+    try:
+        yield radio
+    finally:
+        await radio.close()
+
+
+@asynccontextmanager
+async def _connected(name: str, hci: str | None) -> AsyncGenerator[Bolt]:
+    """A connected robot, real, virtual or served; stopped and let go on every way out."""
     if name == "virtual":
+        if hci is not None:
+            raise RequestError("`virtual` is a robot of this process; with --hci, name the one that is served there")
         settings = load_settings(None, {"camera": "none"})
         seed = np.random.SeedSequence(settings.seed)
         async with virtual_world(settings, seed, RobotProfile()) as world, _held(world.robot) as robot:
             yield robot
     else:
-        async with _held(Bolt(name)) as robot:
-            yield robot
+        async with _air(hci) as radio:
+            backend, scanner = (radio.client_backend, radio.scanner_backend) if radio is not None else (None, None)
+            async with _held(Bolt(name, backend=backend, scanner_backend=scanner)) as robot:
+                yield robot
 
 
 @asynccontextmanager

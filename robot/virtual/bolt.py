@@ -57,6 +57,19 @@ class BoltSettings:
             raise RequestError("virtual BOLT: its scale and times must be above 0, `chunk_bytes` 0 or more")
 
 
+def address_of(name: str) -> str:
+    """The Bluetooth address of the virtual BOLT called ``name``.
+
+    Raises:
+        RequestError: The name is not a BOLT's.
+    """
+    if not re.fullmatch(r"SB-[0-9A-Fa-f]{4}", name):
+        raise RequestError(f"virtual BOLT: {name!r} is no BOLT's name; call it SB- and four hexadecimal digits")
+    digits = name[3:].upper()
+    # The two top bits set make it a static random address.
+    return f"D0:5F:B8:00:{digits[:2]}:{digits[2:]}"
+
+
 class VirtualBolt:
     """A BOLT that lives in this process.
 
@@ -73,14 +86,10 @@ class VirtualBolt:
     def __init__(
         self, radio: VirtualRadio, body: Body, name: str = "SB-1234", settings: BoltSettings | None = None
     ) -> None:
-        if not re.fullmatch(r"SB-[0-9A-Fa-f]{4}", name):
-            raise RequestError(f"virtual BOLT: {name!r} is no BOLT's name; call it SB- and four hexadecimal digits")
         self.name = name
         self.body = body
         self.settings = settings if settings is not None else BoltSettings()
-        digits = name[3:].upper()
-        # The two top bits set make it a static random address.
-        self.address = f"D0:5F:B8:00:{digits[:2]}:{digits[2:]}"
+        self.address = address_of(name)
         self._radio = radio
         self._peripheral: Peripheral | None = None
         self._parser = PacketParser()

@@ -1,6 +1,6 @@
 """bleak backends on the virtual radio: the real ``BleakClient`` and ``BleakScanner`` run on top of them."""
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false, reportUnknownArgumentType=false
-# bumble carries py.typed but leaves many signatures bare; nothing of it leaves this file and radio.
+# bumble carries py.typed but leaves many signatures bare; nothing of it leaves this package.
 
 from __future__ import annotations
 
@@ -29,24 +29,24 @@ from bumble.device import Advertisement, Connection, Peer
 from robot.errors import RadioError
 
 if TYPE_CHECKING:
-    from robot.virtual.radio import VirtualRadio
+    from robot.virtual.antenna import Antenna
 
 _CALL_TIMEOUT_S = 10.0
 _DISCONNECT_TIMEOUT_S = 2.0
 
 
-def client_backend(radio: VirtualRadio) -> type[BaseBleakClient]:
+def client_backend(radio: Antenna) -> type[BaseBleakClient]:
     """The client backend class that reaches the robots on ``radio``."""
     return type("VirtualClient", (_Client,), {"radio": radio})
 
 
-def scanner_backend(radio: VirtualRadio) -> type[BaseBleakScanner]:
+def scanner_backend(radio: Antenna) -> type[BaseBleakScanner]:
     """The scanner backend class that hears the robots on ``radio``."""
     return type("VirtualScanner", (_Scanner,), {"radio": radio})
 
 
 class _Scanner(BaseBleakScanner):
-    radio: ClassVar[VirtualRadio]
+    radio: ClassVar[Antenna]
 
     def __init__(
         self,
@@ -86,7 +86,7 @@ class _Scanner(BaseBleakScanner):
 
 
 class _Client(BaseBleakClient):
-    radio: ClassVar[VirtualRadio]
+    radio: ClassVar[Antenna]
 
     def __init__(
         self,

@@ -10,29 +10,33 @@ bleak's. What the air would do (delay, lost notifications, a broken link) is ask
 from __future__ import annotations
 
 import asyncio
-import contextlib
-from collections.abc import AsyncGenerator, Callable
-from dataclasses import dataclass, field
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
 
-from bleak.backends.client import BaseBleakClient
-from bleak.backends.scanner import BaseBleakScanner
-from bumble import att, core, hci
-from bumble.data_types import CompleteLocalName
-from bumble.device import Advertisement, Connection, Device, DeviceConfiguration
+from bumble import att
+from bumble.device import Connection, Device
 from bumble.gatt import Characteristic, CharacteristicValue, Service
 from numpy.random import Generator
 
 from lab.base.errors import RequestError
 from robot.errors import RadioError
-from robot.virtual.air import NOTIFICATION, Air, QuietController, QuietDevice, QuietHost
-from robot.virtual.gatt_backend import client_backend, scanner_backend
+from robot.virtual.air import CONNECTION_TIMEOUT, NOTIFICATION, Air, QuietController, QuietHost
+from robot.virtual.antenna import ATT_DEFAULT_MTU, AirSettings, Antenna, device_on
 
-ATT_DEFAULT_MTU = 23
+__all__ = [
+    "CONNECTION_TIMEOUT",
+    "REMOTE_USER_TERMINATED",
+    "AirSettings",
+    "GattCharacteristic",
+    "GattService",
+    "Peripheral",
+    "VirtualRadio",
+]
+
 _ATT_CID = 4
 _CENTRAL_ADDRESS = "F0:F0:F0:00:00:01"
 _CALL_TIMEOUT_S = 5.0
-_ADVERTISING_INTERVAL_MS = 200.0
-CONNECTION_TIMEOUT = 0x08
 REMOTE_USER_TERMINATED = 0x13
 
 
@@ -52,27 +56,6 @@ class GattService:
 
     uuid: str
     characteristics: tuple[GattCharacteristic, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class AirSettings:
-    """What the air does.
-
-    Attributes:
-        mtu: Largest ATT packet that the central asks for; 23 is the least, and forces fragments.
-        latency_s: Delay of every packet.
-        lost_share: Share of the notifications that never arrive.
-    """
-
-    mtu: int = 185
-    latency_s: float = 0.0
-    lost_share: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not ATT_DEFAULT_MTU <= self.mtu <= 247:
-            raise RequestError(f"virtual radio: `mtu` must be 23 to 247, got {self.mtu}")
-        if not (self.latency_s >= 0 and 0 <= self.lost_share <= 1):
-            raise RequestError("virtual radio: `latency_s` must not be negative, `lost_share` 0 to 1")
 
 
 class Peripheral:
@@ -208,15 +191,7 @@ class Peripheral:
         showing.add_done_callback(self._showing.discard)
 
 
-@dataclass(slots=True)
-class _Listening:
-    """Who listens for advertisements."""
-
-    ears: list[Callable[[Advertisement], None]] = field(default_factory=list[Callable[[Advertisement], None]])
-    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
-
-
-class VirtualRadio:
+class VirtualRadio(Antenna):
     """The air, and this machine's antenna in it.
 
     Args:
@@ -228,37 +203,14 @@ class VirtualRadio:
     """
 
     def __init__(self, settings: AirSettings | None = None, *, rng: Generator | None = None) -> None:
-        self.settings = settings if settings is not None else AirSettings()
+        super().__init__(settings)
         if self.settings.lost_share and rng is None:
             raise RequestError("virtual radio: losing notifications needs a random generator; hand one in")
         self._rng = rng
         self._air: Air | None = None
-        self._central: Device | None = None
-        self._listening = _Listening()
         self._peripherals: list[Peripheral] = []
         self._controllers: dict[Device, QuietController] = {}
-        self._connecting = asyncio.Lock()
-
-    @property
-    def client_backend(self) -> type[BaseBleakClient]:
-        """What bleak's ``BleakClient(backend=...)`` takes."""
-        return client_backend(self)
-
-    @property
-    def scanner_backend(self) -> type[BaseBleakScanner]:
-        """What bleak's ``BleakScanner(backend=...)`` takes."""
-        return scanner_backend(self)
-
-    @property
-    def central(self) -> Device:
-        """This machine's radio.
-
-        Raises:
-            RadioError: The radio is not started.
-        """
-        if self._central is None:
-            raise RadioError("the virtual radio is off: start it first")
-        return self._central
+        self._guests = itertools.count(1)
 
     async def start(self) -> None:
         """Switch this machine's radio on."""
@@ -266,21 +218,13 @@ class VirtualRadio:
             return
         settings = self.settings
         self._air = Air(settings.latency_s, settings.lost_share, self._rng)
-        central = self.make_device("host", _CENTRAL_ADDRESS)
-        async with asyncio.timeout(_CALL_TIMEOUT_S):
-            await central.power_on()
-        central.on(Device.EVENT_ADVERTISEMENT, self._heard)
-        self._central = central
+        await self._switch_on(self.make_device("host", _CENTRAL_ADDRESS))
 
     async def close(self) -> None:
         """Switch everything off."""
         for peripheral in tuple(self._peripherals):
             await peripheral.close()
-        central, self._central = self._central, None
-        if central is not None:
-            with contextlib.suppress(core.BaseBumbleError, hci.HCI_Error, TimeoutError):
-                async with asyncio.timeout(_CALL_TIMEOUT_S):
-                    await central.power_off()
+        await self._switch_off()
         self._controllers.clear()
         self._air = None
 
@@ -294,16 +238,33 @@ class VirtualRadio:
             raise RadioError("the virtual radio is off: start it first")
         controller = QuietController(name, self._air)
         host = QuietHost(controller)
-        configuration = DeviceConfiguration(
-            name=name,
-            address=hci.Address(address),
-            advertising_interval_min=_ADVERTISING_INTERVAL_MS,
-            advertising_interval_max=_ADVERTISING_INTERVAL_MS,
-            advertising_data=bytes(core.AdvertisingData([CompleteLocalName(name)])),
-        )
-        device = QuietDevice(config=configuration, host=host)
+        controller.host = host
+        device = device_on(host, name, address)
         self._controllers[device] = controller
         return device
+
+    def admit(self) -> QuietController:
+        """A controller in this air for a host of somebody else's, who sets its ``host``; ``dismiss`` it in the end.
+
+        Raises:
+            RadioError: The radio is not started.
+        """
+        if self._air is None:
+            raise RadioError("the virtual radio is off: start it first")
+        number = next(self._guests) % 0x10000
+        # Public addresses of their own, for hosts that do not set a random one.
+        address = f"00:5F:B8:01:{number >> 8:02X}:{number & 0xFF:02X}"
+        return QuietController(f"guest {number}", self._air, public_address=address)
+
+    def dismiss(self, controller: QuietController) -> None:
+        """Take the controller of a host that is gone off the air; its peers find that they hear nothing."""
+        controller.host = None
+        controller.vanish()
+        if self._air is not None:
+            self._air.remove_controller(controller)
+
+    async def _withdraw(self, central: Device) -> None:
+        self.controller_of(central).give_up_connecting()
 
     def controller_of(self, device: Device) -> QuietController:
         """The controller of a device made by ``make_device``."""
@@ -325,58 +286,3 @@ class VirtualRadio:
         """Take a closed peripheral off the air."""
         if peripheral in self._peripherals:
             self._peripherals.remove(peripheral)
-
-    @contextlib.asynccontextmanager
-    async def listening(self, ear: Callable[[Advertisement], None]) -> AsyncGenerator[None]:
-        """Hand every advertisement to ``ear`` in the body."""
-        await self.listen(ear)
-        try:
-            yield
-        finally:
-            await self.unlisten(ear)
-
-    async def listen(self, ear: Callable[[Advertisement], None]) -> None:
-        """Begin to hand every advertisement to ``ear``."""
-        async with asyncio.timeout(_CALL_TIMEOUT_S), self._listening.lock:
-            central = self.central
-            if not self._listening.ears:
-                await central.start_scanning(filter_duplicates=False)
-            self._listening.ears.append(ear)
-
-    async def unlisten(self, ear: Callable[[Advertisement], None]) -> None:
-        """Hand no more advertisements to ``ear``."""
-        async with asyncio.timeout(_CALL_TIMEOUT_S), self._listening.lock:
-            if ear in self._listening.ears:
-                self._listening.ears.remove(ear)
-            if not self._listening.ears and self._central is not None:
-                await self._central.stop_scanning()
-
-    async def connect(self, address: str, timeout_s: float) -> Connection:
-        """Connect the central to a peripheral once it has been heard.
-
-        A connection request to somebody who is not there would stay with the controller for ever.
-
-        Raises:
-            TimeoutError: It is not heard, or does not answer, within ``timeout_s``.
-            RadioError: The radio is not started.
-        """
-        heard = asyncio.Event()
-
-        def ear(advertisement: Advertisement) -> None:
-            if advertisement.address.to_string(False).lower() == address.lower():
-                heard.set()
-
-        async with asyncio.timeout(timeout_s), self._connecting:
-            async with self.listening(ear):
-                await heard.wait()
-            central = self.central
-            try:
-                return await central.connect_le(hci.Address(address), timeout=None)
-            except BaseException:
-                # Out of time or cancelled: nobody may find this request in the way.
-                self.controller_of(central).give_up_connecting()
-                raise
-
-    def _heard(self, advertisement: Advertisement) -> None:
-        for ear in tuple(self._listening.ears):
-            ear(advertisement)

@@ -385,6 +385,11 @@ def test_agreement_is_bland_and_altmans(result):
     found = agreement(pd.DataFrame({"robot_length_cm": robot, "true_length_cm": camera}))
     assert found.scale == pytest.approx(np.linalg.lstsq(camera[:, None], robot)[0][0])
     assert found.scale == pytest.approx(1.02, abs=0.001)
+    again = [
+        agreement(pd.DataFrame({"robot_length_cm": camera + rng.normal(0, 0.3, camera.size), "true_length_cm": camera}))
+        for _ in range(200)
+    ]
+    assert np.std([one.scale for one in again]) == pytest.approx(again[0].scale_sigma, rel=0.2)
     low, high = found.limits_cm
     between = np.mean((robot - camera > low) & (robot - camera < high))
     assert between == pytest.approx(0.95, abs=0.02)

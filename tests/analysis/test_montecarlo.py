@@ -181,7 +181,7 @@ def test_progress_reaches_the_end(shapes, lines, rng):
 
 
 def test_a_sensor_read_in_steps_sees_odd_cells_only():
-    # Read at 0.5, 1.5, …: the crossing at 1 is seen; 1.6 and 2.0 are one cell, and nothing; of the next three the middle.
+    # Read at 0.5, 1.5, …: the crossing at 1 is seen, the pair 1.6, 2.0 is not, and of the next three the middle one.
     for function in (ragged_sampled, ragged_sampled.py_func):
         keep = np.zeros(7, dtype=bool)
         t = np.array([1.0, 1.6, 2.0, 2.6, 2.8, 3.1, 1.0])

@@ -68,7 +68,7 @@ def test_known_sigmas(name):
 
 
 def test_square_by_closed_form():
-    # For the unit square <𝓛_1> = π/4 and <𝓛_3> = 3/4; at θ ≤ π/4 a chord is full, h = 1/cos θ, over a width cos θ − sin θ
+    # For the unit square <𝓛_1> = π/4 and <𝓛_3> = 3/4; at θ ≤ π/4 a chord is full, 1/cos θ, over a width cos θ − sin θ
     # and falls linearly to 0 over sin θ on either side.
     theta = (np.arange(200_000) + 0.5) * np.pi / 4 / 200_000
     h, full, side = 1 / np.cos(theta), np.cos(theta) - np.sin(theta), np.sin(theta)

@@ -170,6 +170,8 @@ def test_a_line_that_no_entry_explains_moves_nobody_far(tables):
     recogniser = LineRecogniser(tables)
     recogniser.update(8, 1.0, 900.0)
     assert max(recogniser.posterior().values()) < 0.9
+    # No single line, however foreign to an entry, rules it out: 0.98/(0.02/2/6) to one at the very most.
+    assert np.ptp(tables.log_probability, axis=0).max() < np.log(600)
 
 
 def test_priors_and_weights(moments, tables, six, rng):
@@ -207,6 +209,8 @@ def test_ideal_sensor_changes_nothing_and_each_fault_its_own(six, rng):
     assert same.s_cm is thrown.s_cm
     jittered = LineModel(jitter_cm=0.3).observe(thrown, rng)
     assert np.std(jittered.s_cm - thrown.s_cm) == pytest.approx(0.3, rel=0.03)
+    shaken = LineModel(jitter_cm=5.0).observe(thrown, rng)
+    assert (shaken.chords_cm >= 0).all()
     scaled = LineModel(scale_sigma=0.02).observe(thrown, rng)
     ratio = scaled.chords_cm / thrown.chords_cm
     assert ratio.std() == pytest.approx(0.02, rel=0.1)

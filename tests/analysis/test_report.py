@@ -320,7 +320,7 @@ def test_a_wrong_speed_is_seen_and_named():
     problems = verdict_of(fast).problems
     stretched = next(problem for problem in problems if "lengths are" in problem.what)
     assert 8.6 < float(re.search(r"\+([\d.]+) %", stretched.what)[1]) < 9.4
-    assert "calibrate robot" in stretched.next_step
+    assert "motion.cm_s_per_unit" in stretched.next_step
     assert any("wrong speed or scale" in problem.next_step for problem in problems)
     assert verdict_of(fast).tone == "fair"
 
@@ -341,6 +341,11 @@ def test_what_spoils_a_session_is_said(result):
     assert "p-value: < 0.001 (Rayleigh)" in verdict_of(spoilt).findings[-1].text
     short = verdict_of(replace(result, estimates=result.estimates[:8]))
     assert any("Only 8 lines" in problem.what for problem in short.problems)
+    unmatched = verdict_of(replace(result, chords_missed=30, chords_extra=28))
+    assert any("not matched" in problem.next_step for problem in unmatched.problems)
+    assert not any("lowers P" in problem.what for problem in unmatched.problems)
+    few = result.chord_pairs.iloc[:3].assign(robot_length_cm=[10.0, 12.0, 10.5], true_length_cm=[10.0, 11.0, 10.9])
+    assert not any("lengths are" in problem.what for problem in verdict_of(replace(result, chord_pairs=few)).problems)
     clean = verdict_of(replace(result, chords_missed=0))
     assert clean.tone == "good"
     assert clean.problems == ()

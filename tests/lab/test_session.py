@@ -69,7 +69,7 @@ def test_raw_light_gives_the_same_crossings_again(square_session):
     speed_cm_s = session.manifest["devices"]["cruising_cm_s"]
     for line in tables.lines.itertuples():
         light = pd.read_parquet(square_session.folder / f"lines/{line.line:06d}/light.parquet")
-        s_cm = speed_cm_s * (light["t_host_s"] - line.t_start_s)
+        s_cm = (speed_cm_s * (light["t_host_s"] - line.t_rolling_s)).clip(lower=0).fillna(0)
         again = crossings_of(light["t_host_s"], s_cm, light["light_lux"], levels)
         stored = tables.crossings[tables.crossings["line"] == line.line]
         assert [c.s_cm for c in again] == pytest.approx(stored["s_cm"].tolist())

@@ -19,7 +19,8 @@ def writer(tmp_path, **manifest):
 
 def line_event(line, **changes):
     event = {
-        "line": line, "t_start_s": 1.0 * line, "t_end_s": line + 0.5, "length_cm": 50.0, "speed_cm_s": 25.0,
+        "line": line, "t_start_s": 1.0 * line, "t_rolling_s": line + 0.05, "t_end_s": line + 0.5,
+        "length_cm": 50.0, "speed_cm_s": 25.0,
         "ended": "bump", "counts": True, "k": 1, "l1_cm": 10.0, "l3_cm3": 1000.0,
         "crossings": [[line + 0.1, 5.0, True], [line + 0.3, 15.0, False]],
     }  # fmt: skip

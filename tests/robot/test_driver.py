@@ -424,3 +424,115 @@ def test_the_parser_is_fresh_after_each_connection(bench) -> None:
             assert b.robot.bad_frames == 0
 
     run(main(), virtual=True)
+
+
+class _DeafLink:
+    """A link that never changes: what its owner does has no effect on the next deadline."""
+
+    is_open = True
+    last_write_s = 0.0
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    async def ask(self, request: Request) -> bytes:
+        self.asked += 1
+        return b""
+
+
+def _counted(robot: Bolt, most: int) -> list[int]:
+    """Let ``robot`` read the clock ``most`` times only, so that a busy loop fails instead of hanging."""
+    loop = asyncio.get_running_loop()
+    reads = [0]
+
+    def now_s() -> float:
+        reads[0] += 1
+        assert reads[0] < most, f"busy at {loop.time()} s"
+        return loop.time()
+
+    robot._now_s = now_s
+    return reads
+
+
+async def _ends_by(tender: asyncio.Task[None], s: float) -> None:
+    await asyncio.wait([tender], timeout=s)
+    if tender.done():
+        tender.result()
+    tender.cancel()
+
+
+def test_a_keep_alive_without_effect_does_not_stop_the_clock() -> None:
+    async def main() -> None:
+        robot = Bolt("SB-0000")
+        link = robot._link = _DeafLink()
+        _counted(robot, 20_000)
+        await _ends_by(asyncio.ensure_future(robot._tend()), 10.0)
+        # From 8 s on it is due in every turn, and a turn lasts at least a millisecond.
+        assert 100 < link.asked <= 2_010
+
+    run(main(), virtual=True)
+
+
+@pytest.mark.parametrize("ahead_s", [0.0, 1e-16, 4e-10, 9e-10])
+@pytest.mark.parametrize("turns", [0, 1, 2, 3])
+def test_two_deadlines_within_a_rounding_do_not_chase_each_other(ahead_s: float, turns: int) -> None:
+    """A loop may wake its sleepers a clock's resolution early. One that then sleeps for the rest is woken
+    at once when another is ready in that turn; two that do so in turn keep each other awake, and the clock still."""
+
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        first, second = Bolt("SB-0000"), Bolt("SB-0001")
+        for robot in (first, second):
+            robot._link = _DeafLink()
+            robot._link.last_write_s = math.inf
+            # Half a refresh is 0.4 s: awake at that instant, with the deadline just ahead.
+            robot._refresh_at_s = 0.4 + ahead_s
+            robot._speed_units = 1
+            _counted(robot, 10_000)
+        one = loop.create_task(first._tend())
+        # Both are awake at 0.4 s, in turns of the loop that may differ.
+        await asyncio.sleep(0.4)
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        two = loop.create_task(second._tend())
+        await _ends_by(one, 4.7)
+        await _ends_by(two, 0.0)
+        assert loop.time() == pytest.approx(5.1, abs=0.01)
+        # A repeat every 0.8 s from 0.4 s on.
+        assert first._link.asked == second._link.asked == 6
+
+    run(main(), virtual=True)
+
+
+def test_the_watch_over_a_stream_does_not_chase_a_deadline_either() -> None:
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        failed: list[float] = []
+        tasks: list[asyncio.Task[None]] = []
+        await asyncio.sleep(3.0)
+        for n in range(2):
+            robot = Bolt(f"SB-000{n}")
+            link = robot._link = _DeafLink()
+            link.fail = lambda reason: failed.append(loop.time())
+            # A rounding before the silence is too long.
+            robot._last_sample_s = 4e-10
+            _counted(robot, 10_000)
+            tasks.append(loop.create_task(robot._watch()))
+            await asyncio.sleep(0)
+        await asyncio.wait(tasks, timeout=5.0)
+        assert failed == pytest.approx([3.0, 3.0], abs=0.01)
+
+    run(main(), virtual=True)
+
+
+def test_a_profile_of_no_pauses_at_all_lets_the_clock_run(bench) -> None:
+    async def main() -> None:
+        profile = RobotProfile(command_pacing_s=0.0, keep_alive_s=1e-12, refresh_s=1e-12)
+        async with bench(profile=profile) as b:
+            pinged = drives(b)
+            await b.robot.drive(0.0, 10.0)
+            await asyncio.sleep(0.5)
+            assert 10 < len(pinged) <= 600
+            assert b.lost == []
+
+    run(main(), virtual=True)
