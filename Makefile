@@ -29,7 +29,8 @@ check: setup
 	$(BIN)/codespell $(ROOMS) tests docs README.md CHANGELOG.md Makefile pyproject.toml
 
 bench: setup
-	$(BIN)/python -m pytest tests/bench --benchmark-only --benchmark-columns=min,median,max,rounds $(ARGS)
+	$(BIN)/python -m pytest tests/bench -o addopts=--import-mode=importlib -o python_files='bench_*.py' -o timeout=600 \
+		--benchmark-columns=min,median,max,rounds --benchmark-sort=name $(ARGS)
 
 # The documents are Markdown that reads as it is; this proves that their links and commands hold.
 docs: setup

@@ -261,5 +261,5 @@ def parse_settings(data: dict[str, Any], *, origin: str) -> Settings:
         reason = fault["msg"].removeprefix("Value error, ")
         if fault["type"] == "extra_forbidden":
             reason = "is not a setting; see docs for the list, or take it out"
-        message = f"{origin}: {where + ' ' if where else ''}{reason}"
-        raise RequestError(message) from error
+        message = f"{origin}: {where} {reason}"
+        raise RequestError(" ".join(message.split())) from error  # a key may hold line breaks

@@ -290,7 +290,7 @@ def _of_the_chords(found: Agreement, missed: int, extra: int) -> list[Problem]:
             Problem(
                 f"The robot's lengths are {signed(100 * off)} % off the camera's; that puts "
                 f"{signed(100 * (found.scale**2 - 1))} % on A.",
-                f"Divide `motion.cm_s_per_unit` in the settings by {found.scale:.3f}, or check the camera's calibration.",
+                f"Divide the setting `motion.cm_s_per_unit` by {found.scale:.3f}, or check the camera's calibration.",
             )
         )
     share = missed / (found.chords + missed)

@@ -151,6 +151,8 @@ def virtual(
             if drawn is not None:
                 optics = settings.projector_optics.pinhole()
                 world.projector.show(render(drawn.geometry, optics, settings.sensor.height_cm))
+            # The first look at the light takes some 0.3 s to prepare; taken later, the stream would lack them.
+            world.projector.light_at(np.zeros(1), np.zeros(1), settings.sensor.height_cm)
             server = HciServer(world.radio, host, port, anywhere=allow_remote)
             await server.start()
             try:

@@ -259,7 +259,7 @@ def test_recognised_mistaken_undecided(result):
 
 def test_undecided_for_want_of_lines_or_for_bias(result):
     few = replace(result, estimates=result.estimates[:8], ranking=[("square", 0.7), ("circle", 0.3)])
-    assert "roll on" in verdict_of(few).problems[0].next_step
+    assert "chordlab run --lines" in verdict_of(few).problems[0].next_step
     twin = dict(result.dictionary) | {"twin": replace(result.exact, title="Twin")}
     same = replace(result, dictionary=twin, ranking=[("twin", 0.5), ("square", 0.5)])
     assert "cannot tell them apart" in verdict_of(same).problems[0].what
