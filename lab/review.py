@@ -38,6 +38,12 @@ from tracking.truth import ChordMatch, match_crossings, true_crossings
 Progress = Callable[[int, int], None]
 
 SHORTEST_RUN_CM = 5.0  # a few frames: shorter runs cannot be told from turning on the spot
+_TEST_TITLES = {
+    "rayleigh": "Rayleigh, directions",
+    "hermans_rasson": "Hermans–Rasson, directions",
+    "cramer_von_mises": "Cramér–von Mises, places",
+    "neyman": "Neyman, directions and places",
+}
 _BAND_RUNS = 400
 _BAND_POINTS = 40
 
@@ -270,8 +276,8 @@ def _isotropy(filmed: Filmed, reachable: Polygon) -> Isotropy | None:
     if found is None:
         return None
     u, v = LineSpace.of(reachable).uniforms(filmed.lines["theta_rad"], filmed.lines["p_cm"])
-    p_values = {test.name.replace("_", " "): test.holm_p_value for test in found.tests}
-    return Isotropy(u, v, p_values | {"run length": found.run_length_p}, found.passed, found.verdict)
+    p_values = {_TEST_TITLES.get(test.name, test.name): test.holm_p_value for test in found.tests}
+    return Isotropy(u, v, p_values | {"mean run length": found.run_length_p}, found.passed, found.verdict)
 
 
 def _warnings(found: Reviewed) -> list[str]:

@@ -59,7 +59,7 @@ class ArenaSettings(_Section):
 class MotionSettings(_Section):
     """How the robot rolls and turns."""
 
-    speed_cm_s: Annotated[float, Field(gt=0, le=150)] = 25.0
+    speed_cm_s: Annotated[float, Field(gt=0, le=150)] = 20.0
     """Cruising speed. The paper rolls at 1 cm/s; at most 150 cm/s."""
     turning: Literal["lambert", "uniform"] = "lambert"
     """How it turns at the wall: `lambert` (cosine law: isotropic uniform lines) or `uniform` (biased, to show it)."""
