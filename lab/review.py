@@ -15,7 +15,7 @@ from shapely.geometry import shape as shape_of
 from analysis.estimate import Estimate, estimate
 from analysis.figures.values import Band, Entry, Isotropy
 from analysis.invariants import invariants_table
-from analysis.montecarlo import running_bands
+from analysis.montecarlo import available_cores, running_bands
 from analysis.quadrature import Moments
 from analysis.report.result import SessionResult
 from analysis.report.verdict import verdict_of
@@ -91,8 +91,11 @@ def stored_settings(session: SessionReader) -> Settings:
     return parse_settings(session.manifest.get("settings", {}), origin=f"{session.folder}: manifest settings")
 
 
-def examine(folder: Path, *, workers: int = 2, progress: Progress | None = None) -> Reviewed:
-    """Read a session, track its video where there is one, and compare robot, camera and truth."""
+def examine(folder: Path, *, workers: int | None = None, progress: Progress | None = None) -> Reviewed:
+    """Read a session, track its video where there is one, and compare robot, camera and truth.
+
+    ``workers`` processes track the video; by default one for two cores, since decoding takes two by itself.
+    """
     session = SessionReader(folder)
     settings, shape = stored_settings(session), stored_shape(session)
     rng = np.random.default_rng(settings.seed)
@@ -109,7 +112,9 @@ def examine(folder: Path, *, workers: int = 2, progress: Progress | None = None)
         ranking=ranking,
         posteriors=posteriors,
         robot=_estimate(_counted(tables)),
-        filmed=_filmed(session, settings, shape.geometry, tables, rng, workers, progress),
+        filmed=_filmed(
+            session, settings, shape.geometry, tables, rng, workers or max(1, available_cores() // 2), progress
+        ),
     )
 
 
@@ -301,7 +306,7 @@ def review(
     *,
     report: bool,
     host: Mapping[str, Any] | None = None,
-    workers: int = 2,
+    workers: int | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Examine a session, write its report when asked, and give its figures (``report``: its path, or None)."""
