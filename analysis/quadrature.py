@@ -10,6 +10,7 @@ to less than the tolerance.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -166,37 +167,65 @@ def _integrate(boundary: Boundary, tolerance: float, max_directions: int) -> tup
         return np.concatenate(list(pool.map(work, np.array_split(theta, workers))))
 
     cuts = _critical_angles(x, y, following)
-    fresh_low, fresh_high = cuts[:-1], cuts[1:]
-    low, high = np.empty(0), np.empty(0)
-    values, errors = np.empty((0, N_INTEGRALS)), np.empty((0, N_INTEGRALS))
-    left = max_directions
     with ThreadPoolExecutor(workers) as pool:
+        panels = _panels(cuts[:-1], cuts[1:], evaluate)
+        left = max_directions - panels.low.size * _NODES.size
         while True:
-            half = (fresh_high - fresh_low)[:, None] / 2
-            theta = (fresh_low + fresh_high)[:, None] / 2 + half * _NODES
-            at_nodes = evaluate(theta.ravel()).reshape(*theta.shape, N_INTEGRALS)
-            left -= theta.size
-            kronrod = half * np.einsum("j,ijc->ic", _KRONROD, at_nodes)
-            gauss = half * np.einsum("j,ijc->ic", _GAUSS, at_nodes[:, 1::2])
-            low, high = np.concatenate([low, fresh_low]), np.concatenate([high, fresh_high])
-            values, errors = np.concatenate([values, kronrod]), np.concatenate([errors, np.abs(kronrod - gauss)])
-            total = values.sum(axis=0)
-            relative = (errors / total).max(axis=1)
-            worst_first = np.argsort(-relative, kind="stable")
-            remaining = relative.sum() - np.cumsum(relative[worst_first])
+            total: Floats = panels.integrals.sum(axis=0)
+            relative: Floats = (panels.errors / total).max(axis=1)
+            worst_first: NDArray[np.intp] = np.argsort(-relative, kind="stable")
+            remaining: Floats = relative.sum() - np.cumsum(relative[worst_first])
             # Halve the fewest panels whose errors, once gone, leave half the tolerance.
             count = int(np.searchsorted(-remaining, -tolerance / 2)) + 1
             count = min(count, left // (2 * _NODES.size))
-            if relative.sum() <= tolerance or count < 1:
-                return total, float((errors.sum(axis=0) / total).max())
-            keep = np.ones(low.size, dtype=bool)
-            keep[worst_first[:count]] = False
+            if float(relative.sum()) <= tolerance or count < 1:
+                return total, float((panels.errors.sum(axis=0) / total).max())
+            worst = worst_first[:count]
             # In order of direction, so that the kernel meets nearly sorted vertices.
-            halved = worst_first[:count][np.argsort(low[worst_first[:count]])]
-            middle = (low[halved] + high[halved]) / 2
-            fresh_low = np.column_stack([low[halved], middle]).ravel()
-            fresh_high = np.column_stack([middle, high[halved]]).ravel()
-            low, high, values, errors = low[keep], high[keep], values[keep], errors[keep]
+            halved = worst[np.argsort(panels.low[worst])]
+            middle: Floats = (panels.low[halved] + panels.high[halved]) / 2
+            fresh = _panels(
+                np.column_stack([panels.low[halved], middle]).ravel(),
+                np.column_stack([middle, panels.high[halved]]).ravel(),
+                evaluate,
+            )
+            left -= fresh.low.size * _NODES.size
+            panels = panels.without(worst).joined(fresh)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Panels:
+    """Stretches of θ from ``low`` to ``high`` (panels,), with integrals and errors (panels, N_INTEGRALS)."""
+
+    low: Floats
+    high: Floats
+    integrals: Floats
+    errors: Floats
+
+    def without(self, which: NDArray[np.intp]) -> _Panels:
+        """All but some."""
+        keep: NDArray[np.bool_] = np.ones(self.low.size, dtype=bool)
+        keep[which] = False
+        return _Panels(self.low[keep], self.high[keep], self.integrals[keep], self.errors[keep])
+
+    def joined(self, other: _Panels) -> _Panels:
+        """These and others."""
+        return _Panels(
+            np.concatenate([self.low, other.low]),
+            np.concatenate([self.high, other.high]),
+            np.concatenate([self.integrals, other.integrals]),
+            np.concatenate([self.errors, other.errors]),
+        )
+
+
+def _panels(low: Floats, high: Floats, evaluate: Callable[[Floats], Floats]) -> _Panels:
+    """Integrate each panel by Kronrod's rule; the error is its distance from Gauss's."""
+    half: Floats = (high - low)[:, None] / 2
+    theta: Floats = (low + high)[:, None] / 2 + half * _NODES
+    at_nodes: Floats = evaluate(theta.ravel()).reshape(*theta.shape, N_INTEGRALS)
+    kronrod: Floats = half * np.einsum("j,ijc->ic", _KRONROD, at_nodes)
+    gauss: Floats = half * np.einsum("j,ijc->ic", _GAUSS, at_nodes[:, 1::2])
+    return _Panels(low, high, kronrod, np.abs(kronrod - gauss))
 
 
 def _critical_angles(x: Floats, y: Floats, following: NDArray[np.int64]) -> Floats:

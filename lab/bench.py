@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncGenerator
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from tracking.cameras import Camera, open_camera
 from tracking.recorder import Recorder
 
 Picture = NDArray[np.uint8]
+_PUMP_EVERY_S = 0.5
 SHAPE_MARGIN_CM = 4.0  # a ball's radius and a little: what lies nearer to the wall, the sensor never reaches
 
 
@@ -66,6 +68,14 @@ class Bench:
         }
 
 
+async def _keep_alive(projector: ProjectorDevice) -> None:
+    """Answer a window's events, or the desktop takes it for frozen; other projectors need nothing."""
+    pump = getattr(projector, "pump", None)
+    while pump is not None:
+        pump()
+        await asyncio.sleep(_PUMP_EVERY_S)
+
+
 @asynccontextmanager
 async def open_bench(settings: Settings, shape: Shape, seed: np.random.SeedSequence) -> AsyncGenerator[Bench]:
     """Open the bench for one shape.
@@ -87,6 +97,8 @@ async def open_bench(settings: Settings, shape: Shape, seed: np.random.SeedSeque
             projector = open_projector(settings.projector, image_size=optics.image_size)
             camera = None if settings.camera == "none" else open_camera(settings.camera)
         stack.callback(projector.close)
+        window = asyncio.create_task(_keep_alive(projector))
+        stack.callback(window.cancel)
         width_px, height_px = projector.image_size
         pictures = Pictures(
             shape=render(shape.geometry, optics, settings.sensor.height_cm),

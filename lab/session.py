@@ -9,18 +9,18 @@ import asyncio
 import contextlib
 import logging
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
 import numpy as np
-import pandas as pd
 
 from analysis.recognition import Recogniser
 from lab.base.errors import ChordlabError
 from lab.bench import Bench
+from lab.run import STALL_CM, Run
 from lab.settings import Settings
 from lab.store import SessionWriter
-from robot.crossings import Crossing, CrossingDetector, Levels, learn_levels
+from robot.crossings import CrossingDetector, Levels, learn_levels
 from robot.device import Bump, Identity, Sample
 from robot.onboard import Estimator
 from robot.turning import turn
@@ -32,8 +32,6 @@ LOWEST_BATTERY_V = 3.5
 _SETTLE_S = 0.3  # a projector's latency and a light sample under way, after the picture changes
 _GIVE_UP_S = 15.0  # for what takes a second when all is well
 _BATTERY_EVERY_S = 60.0
-_STALL_S = 2.0  # longer than any turn on the spot
-_STALL_CM = 0.5
 
 
 class SessionError(ChordlabError):
@@ -74,62 +72,6 @@ class Outcome:
     rolling_s: float
 
 
-@dataclass(slots=True)
-class _Run:
-    """The run in progress: samples as they come, and the crossings that they confirm."""
-
-    line: int
-    t_start_s: float
-    speed_cm_s: float
-    by_odometry: bool
-    detector: CrossingDetector
-    samples: list[Sample] = field(default_factory=list[Sample])
-    crossings: list[Crossing] = field(default_factory=list[Crossing])
-    rolled_cm: float = 0.0
-    t_rolling_s: float | None = None
-    moved_s: float = 0.0
-    moved_cm: float = 0.0
-
-    def path_cm(self, t_s: float) -> float:
-        """Distance along the run: time since it rolls × speed, or what the wheels counted up to the last sample."""
-        if self.by_odometry:
-            return self.rolled_cm
-        return self.speed_cm_s * (t_s - self.t_rolling_s) if self.t_rolling_s is not None else 0.0
-
-    def feed(self, sample: Sample) -> None:
-        if self.samples:
-            last = self.samples[-1]
-            self.rolled_cm += math.hypot(sample.x_cm - last.x_cm, sample.y_cm - last.y_cm)
-            half_cm_s = self.speed_cm_s / 2
-            if self.t_rolling_s is None and last.speed_cm_s < half_cm_s <= sample.speed_cm_s:
-                # A ball that gathers speed evenly is, once at full speed, where it would be had it started at
-                # full speed at the moment when it passed half of it.
-                part = (half_cm_s - last.speed_cm_s) / (sample.speed_cm_s - last.speed_cm_s)
-                self.t_rolling_s = last.t_host_s + part * (sample.t_host_s - last.t_host_s)
-        else:
-            self.moved_s = sample.t_host_s
-        if self.rolled_cm > self.moved_cm + _STALL_CM:
-            self.moved_s, self.moved_cm = sample.t_host_s, self.rolled_cm
-        self.samples.append(sample)
-        self._keep(self.detector.feed(sample.t_host_s, self.path_cm(sample.t_host_s), sample.light_lux))
-
-    @property
-    def stalled(self) -> bool:
-        """Whether it has not moved for longer than a turn takes: it pushes against a wall, or is held."""
-        return bool(self.samples) and self.samples[-1].t_host_s - self.moved_s > _STALL_S
-
-    def finish(self, t_s: float) -> None:
-        self._keep(self.detector.finish(t_s, self.path_cm(t_s)))
-
-    def _keep(self, crossing: Crossing | None) -> None:
-        if crossing is not None:
-            self.crossings.append(crossing)
-
-    def light(self) -> pd.DataFrame:
-        """The raw samples: t_host_s, light_lux, x_cm, y_cm, speed_cm_s."""
-        return pd.DataFrame([asdict(sample) for sample in self.samples], columns=list(Sample.__slots__))
-
-
 class Watcher(Protocol):
     """What follows a session while it runs."""
 
@@ -156,7 +98,7 @@ class Session:
         self._rng = rng
         self._watch = watch
         self._estimator = Estimator()
-        self._run: _Run | None = None
+        self._run: Run | None = None
         self._run_over = asyncio.Event()
         self._bump: Bump | None = None
         self._normal_rad: float | None = None
@@ -220,18 +162,18 @@ class Session:
             writer.finish(asdict(outcome))
         return outcome
 
-    def _next_heading(self, run: _Run) -> float:
+    def _next_heading(self, run: Run) -> float:
         """Turn at the wall, by the policy; where no wall is known, anywhere."""
         if self._bump is not None:
             self._normal_rad = self._bump.normal_heading_rad
-        elif run.rolled_cm > _STALL_CM:
+        elif run.rolled_cm > STALL_CM:
             self._normal_rad = None  # given up in mid-arena
         # else: it set off into the wall that it stands at (the bump's direction is felt with an error), and draws again
         if self._normal_rad is None:
             return self._rng.uniform(0, math.tau)
         return turn(self._settings.motion.turning, self._normal_rad, self._rng)
 
-    async def _one_run(self, writer: SessionWriter, levels: Levels, line: int, heading_rad: float) -> _Run:
+    async def _one_run(self, writer: SessionWriter, levels: Levels, line: int, heading_rad: float) -> Run:
         """Roll from wall to wall once and commit it."""
         settings, robot = self._settings, self._bench.robot
         recorder = self._bench.recorder
@@ -240,7 +182,7 @@ class Session:
         if recorder is not None:
             await recorder.open_segment(writer.video_path(line))
         loop = asyncio.get_running_loop()
-        run = _Run(
+        run = Run(
             line,
             loop.time(),
             self._bench.cruising_cm_s,
@@ -249,8 +191,11 @@ class Session:
         )
         self._run = run  # before it drives: on a short run the bump can come before the command's reply
         self._led_wanted.set()  # a run that ended in the light left the LED lit
-        async with asyncio.timeout(_GIVE_UP_S):
-            await robot.drive(heading_rad, run.speed_cm_s)
+        try:
+            async with asyncio.timeout(_GIVE_UP_S):
+                await robot.drive(heading_rad, run.speed_cm_s)
+        except TimeoutError:
+            raise SessionError(f"{robot.name}: no answer for {_GIVE_UP_S:g} s; bring it nearer and run again") from None
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(settings.motion.run_timeout_s):
                 await self._run_over.wait()
@@ -276,7 +221,7 @@ class Session:
         self._battery_v, self._battery_read_s = await self._bench.robot.battery_v(), now_s
         _check_battery(self._bench.robot.name, self._battery_v)
 
-    def _conclude(self, writer: SessionWriter, run: _Run, t_end_s: float, video: dict[str, int] | None) -> None:
+    def _conclude(self, writer: SessionWriter, run: Run, t_end_s: float, video: dict[str, int] | None) -> None:
         """Estimate from a finished run and put it into the log.
 
         Only runs from wall to wall are lines of the statistics: the first starts inside the arena, and one
@@ -318,7 +263,7 @@ class Session:
         if self._watch is not None:
             self._watch(self._progress(run.line, t_end_s))
 
-    def _invariants(self, run: _Run, counts: bool) -> tuple[int, float, float]:
+    def _invariants(self, run: Run, counts: bool) -> tuple[int, float, float]:
         """Take a run's crossings through the on-board estimator: (k, L1, L3); into the means if it counts."""
         estimator = self._estimator if counts else Estimator(covariance=False)
         estimator.start_line()
@@ -414,7 +359,10 @@ class Session:
                 await self._bench.robot.stop()
         recorder = self._bench.recorder
         if recorder is not None and recorder.segment is not None:
-            await recorder.close_segment()
+            try:
+                await recorder.close_segment()
+            except ChordlabError as error:  # the log must still say how the session ended
+                _log.error("the last video segment is lost: %s", error)
 
 
 def _check_battery(robot: str, battery_v: float) -> None:

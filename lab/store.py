@@ -212,6 +212,8 @@ def disk_faults(folder: Path) -> Generator[None]:
     """Turn a full or failing disk into one clear line."""
     try:
         yield
+    except (TimeoutError, ConnectionError):  # an OSError by descent, but not the disk's
+        raise
     except OSError as error:
         raise ChordlabError(
             f"{folder}: {error.strerror or error}; what was synced before is safe, free some space and run again"

@@ -131,7 +131,10 @@ def _session_bar(settings: Settings, *, quiet: bool) -> Generator[Watcher]:
     with Progress(*columns, console=console, transient=True, disable=quiet or not console.is_terminal) as bar:
         task = bar.add_task("setting out", total=settings.stop.lines)
 
+        told = 0
+
         def watch(step: Step) -> None:
+            nonlocal told
             text = "no line has crossed the shape yet"
             if step.n:
                 text = (
@@ -140,6 +143,10 @@ def _session_bar(settings: Settings, *, quiet: bool) -> Generator[Watcher]:
                     f"{step.leading} {step.posterior:.2f}  battery {step.battery_v:.2f} V"
                 )
             bar.update(task, completed=step.n, description=text)
+            tenth = 10 * step.n // settings.stop.lines
+            if bar.disable and not quiet and tenth > told:  # into a log file: a line for each tenth of the way
+                told = tenth
+                complain(f"line {step.n}/{settings.stop.lines}  {text}")
 
         yield watch
 

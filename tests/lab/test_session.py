@@ -12,6 +12,7 @@ from shapely import LineString, Point, box
 from lab.base.errors import ChordlabError, RequestError
 from lab.experiment import run_experiment
 from lab.finalize import finalize, tables_of
+from lab.review import review
 from lab.session import SessionError
 from lab.settings import load_settings
 from lab.store import SessionReader
@@ -98,6 +99,17 @@ def test_the_same_seed_gives_the_same_session_byte_for_byte(tmp_path):
     pd.testing.assert_frame_equal(*estimates, check_exact=True)
 
 
+def test_the_same_seed_gives_the_same_filmed_session(tmp_path):
+    first, again = (roll(tmp_path / name, camera="virtual", stop__lines=2, seed=4) for name in ("a", "b"))
+    logs = [(rolled.folder / "events.jsonl").read_bytes() for rolled in (first, again)]
+    assert logs[0] == logs[1]
+    tables = [
+        pd.concat(pd.read_parquet(table) for table in sorted(rolled.folder.glob("lines/*/video.frames.parquet")))
+        for rolled in (first, again)
+    ]
+    pd.testing.assert_frame_equal(*tables, check_exact=True)
+
+
 def test_it_stops_on_the_posterior(tmp_path):
     rolled = roll(tmp_path, shape="circle", stop__until=0.95, stop__at_least=15, stop__lines=500)
     assert rolled.finished.outcome.state == "recognised"
@@ -158,6 +170,9 @@ def test_an_interrupt_leaves_a_session_that_reads(tmp_path):
     assert not (finished.folder / "writer.lock").exists()
     last = json.loads((finished.folder / "events.jsonl").read_text().splitlines()[-1])
     assert last["event"] == "end"
+    summary = review(finished.folder, report=True)
+    assert summary["lines"] == 5
+    assert "ended early (interrupted)" in summary["report"].read_text(encoding="utf-8")
 
 
 def test_light_that_does_not_separate_is_refused_before_a_folder_is_made(tmp_path):

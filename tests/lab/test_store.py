@@ -180,3 +180,8 @@ def test_a_missing_table_names_its_cure(tmp_path):
 def test_a_full_disk_is_one_line(tmp_path):
     with pytest.raises(ChordlabError, match=r"No space left.*free some space"), disk_faults(tmp_path):
         raise OSError(28, "No space left on device")
+
+
+def test_a_time_out_is_not_taken_for_the_disk(tmp_path):
+    with pytest.raises(TimeoutError), disk_faults(tmp_path):
+        raise TimeoutError
