@@ -13,6 +13,7 @@ from projector.shape import Shape
 # A crossing is interpolated between two readings: the error of a uniform phase over the step, and of the
 # footprint's ramp that is met at an angle, as measured on the virtual bench.
 _JITTER_PER_STEP = 0.2
+_SPEED_SCATTER = 0.02  # of the speed, from run to run
 # Lines that follow each other at a wall are not independent (lag-1 correlation up to 0.24, so that n lines
 # are worth (1 - 0.24)/(1 + 0.24) n = 0.6 n); counting them in full would make the posterior overconfident.
 _WEIGHT = 0.6
@@ -21,9 +22,7 @@ _WEIGHT = 0.6
 def line_model(settings: Settings) -> LineModel:
     """What the robot of these settings makes of an ideal line."""
     step_cm = settings.motion.speed_cm_s * settings.sensor.interval_s
-    return LineModel(
-        jitter_cm=_JITTER_PER_STEP * step_cm, min_chord_cm=step_cm, scale_sigma=settings.virtual.speed_error_sigma
-    )
+    return LineModel(jitter_cm=_JITTER_PER_STEP * step_cm, min_chord_cm=step_cm, scale_sigma=_SPEED_SCATTER)
 
 
 def recogniser_for(dictionary: Mapping[str, Shape], settings: Settings, rng: np.random.Generator) -> LineRecogniser:

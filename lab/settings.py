@@ -59,7 +59,7 @@ class ArenaSettings(_Section):
 class MotionSettings(_Section):
     """How the robot rolls and turns."""
 
-    speed_cm_s: Annotated[float, Field(gt=0, le=150)] = 20.0
+    speed_cm_s: Annotated[float, Field(gt=0, le=150)] = 15.0
     """Cruising speed. The paper rolls at 1 cm/s; at most 150 cm/s."""
     turning: Literal["lambert", "uniform"] = "lambert"
     """How it turns at the wall: `lambert` (cosine law: isotropic uniform lines) or `uniform` (biased, to show it)."""
@@ -150,7 +150,7 @@ class VirtualSettings(_Section):
     """Relative error of each run's speed, one standard deviation."""
     heading_drift_rad_per_cm: Annotated[float, Field(ge=0, le=0.1)] = 0.0002
     """Curvature of a run, one standard deviation."""
-    footprint_cm: Annotated[float, Field(ge=0, le=5)] = 0.5
+    footprint_cm: Annotated[float, Field(ge=0, le=5)] = 0.3
     """Radius of the floor patch that the light sensor averages over."""
     light_noise_lux: Annotated[float, Field(ge=0)] = 1.0
     """Noise of one light sample, one standard deviation."""

@@ -17,10 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from lab.base.errors import ChordlabError
 
-LOW_FRACTION = 0.35
-HIGH_FRACTION = 0.65
-# The thresholds lie 30 % of the span apart. Ten noise widths of span make that three, and leave 6.5 between
-# either level and the threshold beyond the middle: a false crossing once in ~10^10 samples.
+# Half of the hysteresis: as many noise widths as make a false crossing rarer than 10^-9 a sample, and no more
+# than that, for a chord that never lights the footprint beyond the upper threshold is lost. At the largest
+# share, with levels that only just separate, 6.5 noise widths still lie beyond the thresholds.
+MARGIN_NOISES = 6.0
+LEAST_MARGIN, LARGEST_MARGIN = 0.05, 0.15  # of the span
 SEPARATION_NOISES = 10.0
 NOISE_FLOOR_LUX = 0.5  # a quiet or coarsely quantised sensor repeats itself; its noise is not then nil
 FEWEST_SAMPLES = 5
@@ -84,7 +85,9 @@ def _level_and_noise(lux: NDArray[np.float64]) -> tuple[float, float]:
 
 
 def learn_levels(dark_lux: ArrayLike, bright_lux: ArrayLike, *, separation: float = SEPARATION_NOISES) -> Levels:
-    """Learn the two levels and set the thresholds at 35, 50 and 65 % of the way from dark to light.
+    """Learn the two levels; set the middle halfway and the thresholds six noise widths to either side of it.
+
+    The thresholds keep between 5 and 15 % of the span from the middle.
 
     Args:
         dark_lux: (n,) samples taken outside the shape; non-finite ones are left out.
@@ -119,13 +122,9 @@ def learn_levels(dark_lux: ArrayLike, bright_lux: ArrayLike, *, separation: floa
             f"{noise:.1f} lux apart, and {separation:g} are needed: {cure}",
             **seen,
         )
-    return Levels(
-        dark_lux=low_level,
-        bright_lux=high_level,
-        low_lux=low_level + LOW_FRACTION * span,
-        mid_lux=low_level + 0.5 * span,
-        high_lux=low_level + HIGH_FRACTION * span,
-    )
+    mid = low_level + 0.5 * span
+    margin = min(max(MARGIN_NOISES * noise, LEAST_MARGIN * span), LARGEST_MARGIN * span)
+    return Levels(dark_lux=low_level, bright_lux=high_level, low_lux=mid - margin, mid_lux=mid, high_lux=mid + margin)
 
 
 class CrossingDetector:

@@ -41,7 +41,19 @@ def test_levels_and_thresholds():
     levels = learn_levels(rng.normal(20.0, 2.0, 400), rng.normal(120.0, 2.0, 400))
     assert levels.dark_lux == pytest.approx(20.0, abs=0.5)
     assert levels.bright_lux == pytest.approx(120.0, abs=0.5)
-    assert (levels.low_lux, levels.mid_lux, levels.high_lux) == pytest.approx((55.0, 70.0, 85.0), abs=0.5)
+    # six noise widths of 2 lux to either side of the middle
+    assert levels.mid_lux == pytest.approx(70.0, abs=0.5)
+    assert levels.mid_lux - levels.low_lux == pytest.approx(12.0, abs=1.5)
+    assert levels.high_lux - levels.mid_lux == pytest.approx(12.0, abs=1.5)
+
+
+@pytest.mark.parametrize(("noise_lux", "margin_lux"), [(0.1, 5.0), (1.5, 9.0), (8.0, 15.0)])
+def test_the_hysteresis_follows_the_noise_within_bounds(noise_lux, margin_lux):
+    """At least 5 % of the span of 100 lux, at most 15 %, six noise widths between."""
+    rng = np.random.default_rng(2)
+    levels = learn_levels(rng.normal(20.0, noise_lux, 2000), rng.normal(120.0, noise_lux, 2000))
+    assert levels.high_lux - levels.mid_lux == pytest.approx(margin_lux, rel=0.1)
+    assert levels.mid_lux - levels.low_lux == pytest.approx(margin_lux, rel=0.1)
 
 
 def test_levels_survive_strays_and_lost_samples():
