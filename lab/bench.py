@@ -50,7 +50,7 @@ class Bench:
     pictures: Pictures
     cruising_cm_s: float
 
-    async def show(self, picture: Picture) -> None:
+    def show(self, picture: Picture) -> None:
         """Put a picture on the projector, and tell a virtual camera that its scene has changed."""
         self.projector.show(picture)
         changed = getattr(self.camera, "scene_changed", None)

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from shapely.geometry import mapping
 
-from analysis.quadrature import Moments, exact_moments
 from analysis.recognition import Recogniser
 from lab.base.errors import ChordlabError
 from lab.bench import Bench, open_bench
@@ -54,11 +53,6 @@ def dictionary_with(shape: Shape) -> dict[str, Shape]:
     return known if shape.name in known else {**known, shape.name: shape}
 
 
-def moments_of(dictionary: dict[str, Shape]) -> dict[str, Moments]:
-    """Exact moments of every entry."""
-    return {name: exact_moments(entry.geometry) for name, entry in dictionary.items()}
-
-
 def run_experiment(
     settings: Settings,
     *,
@@ -74,10 +68,10 @@ def run_experiment(
         ChordlabError: nothing was recorded, since the request was wrong or the preflight failed.
     """
     shape = shape_from(settings.shape, font=settings.font)
-    world_seed, turn_seed, table_seed = np.random.SeedSequence(settings.seed).spawn(3)
+    world_seed, turn_seed, _ = settings.seeds()
     dictionary = dictionary_with(shape)
     say(f"dictionary: {len(dictionary)} entries; learning how each looks to a blind robot")
-    recogniser = recogniser_for(dictionary, settings, np.random.default_rng(table_seed))
+    recogniser = recogniser_for(dictionary, settings)
     kept = _Kept()
 
     async def on_the_bench() -> None:

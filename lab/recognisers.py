@@ -25,7 +25,12 @@ def line_model(settings: Settings) -> LineModel:
     return LineModel(jitter_cm=_JITTER_PER_STEP * step_cm, min_chord_cm=step_cm, scale_sigma=_SPEED_SCATTER)
 
 
-def recogniser_for(dictionary: Mapping[str, Shape], settings: Settings, rng: np.random.Generator) -> LineRecogniser:
-    """Learn how each entry's lines look through the robot's sensor, by Monte Carlo."""
+def recogniser_for(dictionary: Mapping[str, Shape], settings: Settings) -> LineRecogniser:
+    """Learn how each entry's lines look through the robot's sensor, by Monte Carlo.
+
+    The same settings give the same recogniser: a stored session, read again, finds the posteriors of its log.
+    """
+    _, _, seed = settings.seeds()
+    rng = np.random.default_rng(seed)
     outlines = {name: shape.geometry for name, shape in dictionary.items()}
     return LineRecogniser(learn_tables(outlines, rng, model=line_model(settings)), weight=_WEIGHT)

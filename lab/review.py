@@ -16,12 +16,12 @@ from analysis.estimate import Estimate, estimate
 from analysis.figures.values import Band, Entry, Isotropy
 from analysis.invariants import invariants_table
 from analysis.montecarlo import available_cores, running_bands
-from analysis.quadrature import Moments
+from analysis.quadrature import Moments, exact_moments
 from analysis.report.result import SessionResult
 from analysis.report.verdict import verdict_of
 from analysis.report.write import write_report
 from lab.base.errors import RequestError
-from lab.experiment import dictionary_with, moments_of
+from lab.experiment import dictionary_with
 from lab.finalize import Tables, finalize
 from lab.recognisers import recogniser_for
 from lab.settings import Settings, parse_settings
@@ -101,13 +101,13 @@ def examine(folder: Path, *, workers: int | None = None, progress: Progress | No
     rng = np.random.default_rng(settings.seed)
     tables = finalize(folder)
     dictionary = dictionary_with(shape)
-    ranking, posteriors = recognised(session, tables)
+    ranking, posteriors = _recognised(dictionary, settings, tables)
     return Reviewed(
         session=session,
         settings=settings,
         shape=shape,
         tables=tables,
-        moments=moments_of(dictionary),
+        moments={name: exact_moments(entry.geometry) for name, entry in dictionary.items()},
         titles={name: entry.title for name, entry in dictionary.items()},
         ranking=ranking,
         posteriors=posteriors,
@@ -120,9 +120,13 @@ def examine(folder: Path, *, workers: int | None = None, progress: Progress | No
 
 def recognised(session: SessionReader, tables: Tables) -> tuple[list[tuple[str, float]], pd.DataFrame]:
     """The final ranking, and ``n`` with one column for each entry: the posterior after each crossing line."""
-    settings = stored_settings(session)
-    dictionary = dictionary_with(stored_shape(session))
-    recogniser = recogniser_for(dictionary, settings, np.random.default_rng(settings.seed))
+    return _recognised(dictionary_with(stored_shape(session)), stored_settings(session), tables)
+
+
+def _recognised(
+    dictionary: dict[str, Shape], settings: Settings, tables: Tables
+) -> tuple[list[tuple[str, float]], pd.DataFrame]:
+    recogniser = recogniser_for(dictionary, settings)
     rows: list[dict[str, float]] = []
     for n, (k, l1_cm, l3_cm3) in enumerate(_counted(tables)[["k", "l1_cm", "l3_cm3"]].to_numpy(), start=1):
         recogniser.update(int(k), l1_cm, l3_cm3)

@@ -128,7 +128,7 @@ class Session:
         dark = await self._light_of(bench.pictures.black)
         bright = await self._light_of(bench.pictures.white)
         levels = learn_levels(dark, bright)
-        await bench.show(bench.pictures.shape)
+        bench.show(bench.pictures.shape)
         await asyncio.sleep(_SETTLE_S)
         return Preflight(identity, levels)
 
@@ -335,7 +335,7 @@ class Session:
 
     async def _light_of(self, picture: np.ndarray[Any, np.dtype[np.uint8]]) -> list[float]:
         """Light samples, in lux, under a picture that fills the arena."""
-        await self._bench.show(picture)
+        self._bench.show(picture)
         await asyncio.sleep(_SETTLE_S)
         samples: list[Sample] = []
         self._waiting, self._enough = samples, asyncio.Event()

@@ -11,6 +11,7 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from shapely import Point, Polygon, box
 
@@ -213,6 +214,11 @@ class Settings(_Section):
     def is_virtual(self) -> bool:
         """Whether the session runs on the virtual bench, at virtual time."""
         return self.robot == "virtual"
+
+    def seeds(self) -> tuple[np.random.SeedSequence, np.random.SeedSequence, np.random.SeedSequence]:
+        """Independent seeds of the virtual world, of the robot's turns, and of what the dictionary is learnt from."""
+        world, turns, tables = np.random.SeedSequence(self.seed).spawn(3)
+        return world, turns, tables
 
     def camera_calibration(self) -> Calibration:
         """The camera's optics with the height of the LED that it follows."""

@@ -18,6 +18,7 @@ from typing import IO, Any, cast
 import pandas as pd
 
 from lab.base.errors import ChordlabError, RequestError
+from lab.base.files import sync_folder, write_aside
 
 SCHEMA_VERSION = 1
 MANIFEST = "manifest.json"
@@ -40,28 +41,6 @@ class SessionFolderError(RequestError):
 def line_folder(folder: Path, line: int) -> Path:
     """The folder of one run."""
     return folder / LINES / f"{line:06d}"
-
-
-def sync_folder(folder: Path) -> None:
-    """Make renames and new names in ``folder`` outlive a power cut (where the system lets a folder be opened)."""
-    if os.name == "nt":
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def write_aside(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all: aside, synced, renamed."""
-    aside = path.with_name(path.name + ".part")
-    with aside.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    aside.replace(path)
-    sync_folder(path.parent)
 
 
 def to_json(data: Any, *, indent: int | None = None) -> str:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from lab.base.files import write_aside
 from projector.device import ProjectorError, ProjectorRequestError, check_image
 
 
@@ -42,10 +43,8 @@ class ImageFolder:
         check_image(image, self._image_size, self._device)
         _, data = cv2.imencode(".png", image)
         path = self.folder / f"{self._last + 1:06d}.png"
-        aside = path.with_suffix(".part")
         try:
-            aside.write_bytes(data.tobytes())
-            aside.replace(path)
+            write_aside(path, data.tobytes())
         except OSError as error:
             raise ProjectorError(f"cannot write {path} ({error.strerror}); free some space or name another") from error
         self._last += 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lab.base.errors import RequestError
+from lab.base.files import write_aside
 from lab.base.pinhole import Pinhole
 
 DEFAULT_LED_HEIGHT_CM = 7.3
@@ -116,11 +116,5 @@ def load_calibration(path: str | Path) -> Calibration:
 
 def save_calibration(calibration: Calibration, path: str | Path) -> None:
     """Write calibration.json, aside first and then renamed, so that a cut never leaves half a file."""
-    file = Path(path)
-    aside = file.with_name(file.name + ".part")
-    with aside.open("w", encoding="utf-8") as stream:
-        json.dump(calibration.to_dict(), stream, indent=2, allow_nan=False)
-        stream.write("\n")
-        stream.flush()
-        os.fsync(stream.fileno())
-    aside.replace(file)
+    text = json.dumps(calibration.to_dict(), indent=2, allow_nan=False)
+    write_aside(Path(path), f"{text}\n".encode())

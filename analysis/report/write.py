@@ -18,6 +18,7 @@ from analysis.report.result import SessionResult
 from analysis.report.tables import provenance_of, tables_of
 from analysis.report.verdict import verdict_of
 from lab.base.errors import RequestError
+from lab.base.files import write_aside
 
 SVG_LIMIT = 300_000  # characters; a larger figure is smaller, and faster to show, as an image
 _SCREEN_DPI = 96
@@ -50,11 +51,9 @@ def write_report(result: SessionResult, path: Path) -> Path:
         ReportFileError: The file cannot be written.
     """
     page = render_report(result)
-    aside = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        aside.write_text(page, encoding="utf-8")
-        aside.replace(path)
+        write_aside(path, page.encode())
     except OSError as error:
         raise ReportFileError(path, error.strerror or type(error).__name__) from error
     return path

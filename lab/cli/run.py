@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -52,10 +53,10 @@ def run(
     with _session_bar(settings, quiet=hushed) as watch:
         finished = run_experiment(settings, started=datetime.now(), watch=watch, say=_hush if hushed else complain)
     rolled_s = time.perf_counter() - began_s
-    tables = finalize(finished.folder)
     if finished.failure is not None:
         complain(f"chordlab: {finished.failure}")
     if finished.interrupted:
+        tables = finalize(finished.folder)
         complain(
             f"interrupted after {len(tables.estimates)} crossing lines; read them: chordlab validate {finished.folder}"
         )
@@ -112,7 +113,6 @@ def _peak_memory_mb() -> float:
     if peak is not None:
         return peak / 1e6
     import resource  # noqa: PLC0415 - not on Windows
-    import sys  # noqa: PLC0415 - for the unit alone
 
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6

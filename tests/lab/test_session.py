@@ -12,7 +12,7 @@ from shapely import LineString, Point, box
 from lab.base.errors import ChordlabError, RequestError
 from lab.experiment import run_experiment
 from lab.finalize import finalize, tables_of
-from lab.review import review
+from lab.review import recognised, review
 from lab.session import SessionError
 from lab.settings import load_settings
 from lab.store import SessionReader
@@ -60,6 +60,14 @@ def test_mean_run_length_is_that_of_isotropic_lines(square_session):
     expected_cm = math.pi * reachable.area / reachable.length
     lengths = lines.loc[lines["counts"], "length_cm"]
     assert abs(lengths.mean() - expected_cm) < 4 * lengths.std() / math.sqrt(len(lengths))
+
+
+def test_a_session_read_again_finds_the_posteriors_of_its_log(square_session):
+    session = SessionReader(square_session.folder)
+    tables = tables_of(session)
+    ranking, posteriors = recognised(session, tables)
+    assert ranking[0] == (tables.estimates["leading"].iloc[-1], tables.estimates["posterior"].iloc[-1])
+    assert posteriors.drop(columns="n").max(axis=1).tolist() == tables.estimates["posterior"].tolist()
 
 
 def test_raw_light_gives_the_same_crossings_again(square_session):
