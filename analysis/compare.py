@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import pandas as pd
@@ -11,7 +12,7 @@ from scipy import stats
 
 from analysis.boundary import Geometry
 from analysis.estimate import Estimate, estimate
-from analysis.invariants import CrossingsError, line_invariants
+from analysis.invariants import invariants_table, lit_lengths
 from analysis.montecarlo import simulate_chords
 from analysis.quadrature import Moments, exact_moments
 from lab.base.errors import RequestError
@@ -62,17 +63,41 @@ class Divergence:
         return max(0.0, self.nats - self.bias_nats)
 
 
+class Known(Protocol):
+    """A shape whose size and scatter are known: `analysis.quadrature.Moments`, or an entry of the figures."""
+
+    @property
+    def area_cm2(self) -> float:
+        """True area."""
+        ...
+
+    @property
+    def perimeter_cm(self) -> float:
+        """True perimeter."""
+        ...
+
+    def covariance_at(self, n: float) -> Floats:
+        """Covariance (2, 2) of (A cm², P cm) after ``n`` crossing lines."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class Deviation:
-    """How far an estimate lies from the truth, in the truth's own standard deviations.
+    """How far an estimate lies from the truth: relative, and in the truth's own standard deviations.
 
     Attributes:
+        area_rel: Â/A − 1.
+        perimeter_rel: P̂/P − 1.
         z_area: (Â − A)/σ_A.
         z_perimeter: (P̂ − P)/σ_P.
         distance2: squared Mahalanobis distance, with the correlation of A and P.
         p_value: probability of at least that distance (χ², 2 degrees of freedom).
+
+    The last two are NaN where the scatter is unknown or singular.
     """
 
+    area_rel: float
+    perimeter_rel: float
     z_area: float
     z_perimeter: float
     distance2: float
@@ -107,16 +132,8 @@ def chord_lengths(crossings: pd.DataFrame) -> Floats:
 
     Lines whose crossings do not pair up are left out, as in `analysis.invariants.invariants_table`.
     """
-    lengths: list[Floats] = []
-    ordered = crossings.sort_values(["line", "order"], kind="stable")
-    for _, line in ordered.groupby("line", sort=True):
-        s_cm = np.asarray(line["s_cm"], dtype=float)
-        try:
-            line_invariants(s_cm, np.asarray(line["entering"], dtype=bool))
-        except CrossingsError:
-            continue
-        lengths.append(s_cm[1::2] - s_cm[::2])
-    return np.concatenate(lengths) if lengths else np.empty(0)
+    unpaired = invariants_table(crossings).attrs.get("unpaired_lines", ())
+    return lit_lengths(crossings[~crossings["line"].isin(list(unpaired))])
 
 
 def compare_chords(measured_cm: ArrayLike, reference_cm: ArrayLike) -> ChordTest:
@@ -159,16 +176,32 @@ def chord_divergence(
     return Divergence(nats, bias, bins)
 
 
-def deviation(measured: Estimate, moments: Moments) -> Deviation:
+def deviation(measured: Estimate, known: Known) -> Deviation:
     """Set an estimate against a shape's exact area and perimeter, in the shape's own σ/√N.
 
-    The shape's σ is used and not the estimate's, which over few lines is as uncertain as the estimate.
+    The shape's σ is used and not the estimate's: as long as the rare long chords are missing from a sample, A and
+    its uncertainty are both too small.
     """
-    covariance = moments.covariance_at(measured.n)
-    error = np.array([measured.area_cm2 - moments.area_cm2, measured.perimeter_cm - moments.perimeter_cm])
-    z_area, z_perimeter = error / np.sqrt(np.diag(covariance))
-    distance2 = float(error @ np.linalg.solve(covariance, error))
-    return Deviation(float(z_area), float(z_perimeter), distance2, float(stats.chi2.sf(distance2, 2)))
+    covariance = known.covariance_at(measured.n)
+    error = np.array([measured.area_cm2 - known.area_cm2, measured.perimeter_cm - known.perimeter_cm])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z_area, z_perimeter = error / np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    distance2 = squared_distance(error, covariance)
+    return Deviation(
+        area_rel=float(error[0] / known.area_cm2),
+        perimeter_rel=float(error[1] / known.perimeter_cm),
+        z_area=float(z_area),
+        z_perimeter=float(z_perimeter),
+        distance2=distance2,
+        p_value=float(stats.chi2.sf(distance2, 2)),
+    )
+
+
+def squared_distance(error: Floats, covariance: Floats) -> float:
+    """Squared Mahalanobis distance of ``error`` (2,); NaN where ``covariance`` (2, 2) is unknown or singular."""
+    if not np.isfinite(covariance).all() or np.linalg.matrix_rank(covariance) < 2:
+        return float("nan")
+    return float(error @ np.linalg.solve(covariance, error))
 
 
 def compare(

@@ -119,6 +119,19 @@ def invariants_table(crossings: pd.DataFrame) -> pd.DataFrame:
     return table
 
 
+def lit_lengths(crossings: pd.DataFrame) -> Floats:
+    """Lengths (n,) in cm of the lit stretches: each entering crossing with the leaving one that follows it.
+
+    A crossing without its partner on the same line makes no chord.
+    """
+    ordered = crossings.sort_values(["line", "order"])
+    line = np.asarray(ordered["line"], dtype=np.int64)
+    s_cm = np.asarray(ordered["s_cm"], dtype=float)
+    entering = ordered["entering"].to_numpy(dtype=bool)
+    lit = (line[1:] == line[:-1]) & entering[:-1] & ~entering[1:]
+    return (s_cm[1:] - s_cm[:-1])[lit]
+
+
 def area_cm2(mean_l1_cm: ArrayLike, mean_l3_cm3: ArrayLike) -> Floats:
     """Eq. 1 with its prefactor put right: A = (π/3) ⟨𝓛_3⟩/⟨𝓛_1⟩. Broadcasts; NaN where ⟨𝓛_1⟩ is 0."""
     l1 = np.asarray(mean_l1_cm, dtype=float)

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -40,19 +39,6 @@ class Chords:
     def mean_cm(self) -> float:
         """The mean chord ⟨ℓ⟩ over chords."""
         return float(self.lengths_cm.mean())
-
-
-def chord_lengths(crossings: pd.DataFrame) -> Floats:
-    """Lengths (n,) in cm of the lit stretches: each entering crossing with the leaving one that follows it.
-
-    A crossing without its partner on the same line makes no chord.
-    """
-    ordered = crossings.sort_values(["line", "order"])
-    line = np.asarray(ordered["line"], dtype=np.int64)
-    s_cm = np.asarray(ordered["s_cm"], dtype=float)
-    entering = ordered["entering"].to_numpy(dtype=bool)
-    lit = (line[1:] == line[:-1]) & entering[:-1] & ~entering[1:]
-    return (s_cm[1:] - s_cm[:-1])[lit]
 
 
 def chords_figure(shapes: Sequence[Chords]) -> Figure:

@@ -10,10 +10,11 @@ from matplotlib.figure import Figure
 
 from analysis.figures.blinks import blinks_figure, panels_at
 from analysis.figures.camera import agreement, chord_pairs_figure
-from analysis.figures.chords import Chords, chord_lengths, chords_figure
+from analysis.figures.chords import Chords, chords_figure
 from analysis.figures.convergence import Convergence, convergence_figure, posterior_figure
 from analysis.figures.isotropy import isotropy_figure, lines_figure
 from analysis.figures.plane import plane_figure
+from analysis.invariants import lit_lengths
 from analysis.report.result import SessionResult
 from analysis.report.words import number, p_value, percent, probability
 
@@ -142,7 +143,7 @@ def _posterior(result: SessionResult) -> Panel | LeftOut:
 def _chords(result: SessionResult) -> Panel | LeftOut:
     title = "Chord lengths"
     measured = result.measured
-    lengths = chord_lengths(result.crossings[result.crossings["line"].isin(result.lines["line"])])
+    lengths = lit_lengths(result.crossings[result.crossings["line"].isin(result.lines["line"])])
     if measured is None or not lengths.size:
         return LeftOut(title, _NO_LINE)
     exact = result.exact

@@ -9,10 +9,11 @@ from typing import cast
 import numpy as np
 import pandas as pd
 
+from analysis.compare import deviation
 from analysis.estimate import Estimate
 from analysis.figures.camera import agreement
 from analysis.report.result import SessionResult
-from analysis.report.verdict import deviation, lines_to_tell_apart
+from analysis.report.verdict import lines_to_tell_apart
 from analysis.report.words import number, p_value, percent, plus_minus, probability, signed
 
 _MOST_ENTRIES = 12
@@ -53,14 +54,14 @@ def _sizes(result: SessionResult, measured: Estimate) -> Table:
         plus_minus(measured.area_cm2, measured.sigma_area_cm2, "cm²"),
         f"{number(exact.area_cm2)} cm²",
         signed(100 * off.area_rel),
-        signed(off.area_sigmas),
+        signed(off.z_area),
     ]
     perimeter = [
         "perimeter P",
         plus_minus(measured.perimeter_cm, measured.sigma_perimeter_cm, "cm"),
         f"{number(exact.perimeter_cm)} cm",
         signed(100 * off.perimeter_rel),
-        signed(off.perimeter_sigmas),
+        signed(off.z_perimeter),
     ]
     if result.camera is not None:
         heads.append("camera")
@@ -68,7 +69,7 @@ def _sizes(result: SessionResult, measured: Estimate) -> Table:
         perimeter.append(plus_minus(result.camera.perimeter_cm, result.camera.sigma_perimeter_cm, "cm"))
     note = (
         f"± is one standard error, estimated from the robot's own {measured.n} lines. σ is the exact scatter that so "
-        f"many lines have on the projected shape; so large a joint deviation has probability {p_value(off.chance)}."
+        f"many lines have on the projected shape; so large a joint deviation has probability {p_value(off.p_value)}."
     )
     return Table("sizes", "Area and perimeter", tuple(heads), (tuple(area), tuple(perimeter)), note)
 

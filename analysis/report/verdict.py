@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.compare import deviation, squared_distance
 from analysis.estimate import Estimate
 from analysis.figures.camera import Agreement, agreement
 from analysis.figures.values import Entry
@@ -49,38 +50,6 @@ class Verdict:
     problems: tuple[Problem, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Deviation:
-    """Measured minus exact: relative, in standard deviations, and how probable so large a joint one is by chance."""
-
-    area_rel: float
-    perimeter_rel: float
-    area_sigmas: float
-    perimeter_sigmas: float
-    chance: float
-
-
-def deviation(measured: Estimate, exact: Entry) -> Deviation:
-    """Compare an estimate with the exact values.
-
-    The measure is the exact scatter of N lines on the projected shape, not the robot's own ±: as long as the rare long
-    chords are missing from a sample, A and its uncertainty are both too small. ``chance`` is exp(−d²/2) with d² the
-    squared Mahalanobis distance (χ² with two degrees of freedom); NaN where the scatter is unknown or singular.
-    """
-    gap = np.array([measured.area_cm2 - exact.area_cm2, measured.perimeter_cm - exact.perimeter_cm])
-    scatter = exact.covariance_at(measured.n)
-    sigma = np.sqrt(np.maximum(np.diag(scatter), 0.0))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        in_sigmas = gap / sigma
-    return Deviation(
-        area_rel=float(gap[0] / exact.area_cm2),
-        perimeter_rel=float(gap[1] / exact.perimeter_cm),
-        area_sigmas=float(in_sigmas[0]),
-        perimeter_sigmas=float(in_sigmas[1]),
-        chance=float(np.exp(-_squared_distance(gap, scatter) / 2)),
-    )
-
-
 def lines_to_tell_apart(one: Entry, other: Entry, stop_at: float) -> float:
     """Crossing lines after which (A, P) tell ``one`` from ``other`` with posterior ``stop_at`` in 95 of 100 sessions.
 
@@ -88,7 +57,7 @@ def lines_to_tell_apart(one: Entry, other: Entry, stop_at: float) -> float:
     x = √(N d²) must satisfy x²/2 − 1.645 x = ln(s/(1 − s)). Infinite for equal (A, P).
     """
     gap = np.array([one.area_cm2 - other.area_cm2, one.perimeter_cm - other.perimeter_cm])
-    squared = _squared_distance(gap, (one.covariance_per_line + other.covariance_per_line) / 2)
+    squared = squared_distance(gap, (one.covariance_per_line + other.covariance_per_line) / 2)
     odds = np.log(stop_at / (1 - stop_at)) if stop_at < 1 else np.inf
     return float((1.645 + np.sqrt(1.645**2 + 2 * max(odds, 0.0))) ** 2 / squared) if squared > 1e-9 else float("inf")
 
@@ -177,12 +146,12 @@ def _sizes(result: SessionResult, measured: Estimate) -> list[Finding]:
         Finding(
             "Area",
             f"A = {plus_minus(measured.area_cm2, measured.sigma_area_cm2, 'cm²')}; projected "
-            f"{number(shape.area_cm2)} cm²: {signed(100 * off.area_rel)} %, {signed(off.area_sigmas)} σ.",
+            f"{number(shape.area_cm2)} cm²: {signed(100 * off.area_rel)} %, {signed(off.z_area)} σ.",
         ),
         Finding(
             "Perimeter",
             f"P = {plus_minus(measured.perimeter_cm, measured.sigma_perimeter_cm, 'cm')}; projected "
-            f"{number(shape.perimeter_cm)} cm: {signed(100 * off.perimeter_rel)} %, {signed(off.perimeter_sigmas)} σ.",
+            f"{number(shape.perimeter_cm)} cm: {signed(100 * off.perimeter_rel)} %, {signed(off.z_perimeter)} σ.",
         ),
     ]
 
@@ -264,11 +233,11 @@ def _undecided(result: SessionResult, measured: Estimate, rival: str, needed: fl
 def _of_the_sizes(result: SessionResult, measured: Estimate) -> list[Problem]:
     problems: list[Problem] = []
     off = deviation(measured, result.exact)
-    if off.chance < UNLIKELY:
+    if off.p_value < UNLIKELY:
         stretched = abs(off.area_rel - 2 * off.perimeter_rel) < 0.5 * abs(off.area_rel)
         problems.append(
             Problem(
-                f"A and P deviate more than chance allows (p {p_value(off.chance)}).",
+                f"A and P deviate more than chance allows (p {p_value(off.p_value)}).",
                 "A deviates about twice as much as P, as a wrong speed or scale makes it: check `motion.cm_s_per_unit` "
                 "in the settings, then the projector's height."
                 if stretched
@@ -335,9 +304,3 @@ def _of_the_runs(result: SessionResult) -> list[Problem]:
             )
         )
     return problems
-
-
-def _squared_distance(gap: Floats, covariance: Floats) -> float:
-    if not np.isfinite(covariance).all() or np.linalg.matrix_rank(covariance) < 2:
-        return float("nan")
-    return float(gap @ np.linalg.solve(covariance, gap))

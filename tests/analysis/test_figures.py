@@ -16,12 +16,13 @@ from matplotlib.patches import PathPatch
 from analysis.figures import pen
 from analysis.figures.blinks import blinks_figure, lit_positions
 from analysis.figures.camera import agreement, chord_pairs_figure
-from analysis.figures.chords import Chords, chord_lengths, chords_figure
+from analysis.figures.chords import Chords, chords_figure
 from analysis.figures.convergence import Convergence, convergence_figure, posterior_figure
 from analysis.figures.isotropy import isotropy_figure, lines_figure
 from analysis.figures.plane import plane_figure
 from analysis.figures.style import colour_of, png_bytes, save_figure, svg_text
 from analysis.figures.values import Band, Entry, Isotropy, Measured
+from analysis.invariants import lit_lengths
 from analysis.quadrature import exact_moments
 from tests.analysis import sample_session as sample
 
@@ -61,7 +62,7 @@ def band_of(shape, n_last, runs=30, seed=5):
 
 def all_figures(result):
     exact = result.exact
-    lengths = chord_lengths(result.crossings)
+    lengths = lit_lengths(result.crossings)
     area = result.measured.area_cm2
     one = Convergence(result.name, result.title, result.estimates, exact, band_of("eiffel", len(result.estimates)))
     return {
@@ -215,7 +216,7 @@ def test_histogram_marks_the_mean_chord_and_the_root_of_the_area(result):
     # The truth from the geometry, chord by chord: the camera's lengths are not the robot's.
     ends = result.true_lines[["x_start_cm", "y_start_cm", "x_end_cm", "y_end_cm"]].to_numpy()
     truth = [b - a for row in ends for a, b in sample.chords_of(row, result.geometry)]
-    lengths = chord_lengths(result.true_crossings)
+    lengths = lit_lengths(result.true_crossings)
     np.testing.assert_allclose(np.sort(lengths), np.sort(truth))
     figure = chords_figure([Chords("eiffel", "Eiffel Tower", lengths, 625.0, 630.0, 181.0)])
     longest = max(truth)
@@ -240,8 +241,8 @@ def test_a_crossing_without_its_partner_makes_no_chord():
             "entering": [False, True, True, False, True, False],
         }
     )
-    np.testing.assert_allclose(chord_lengths(crossings), [7.0, 3.0])
-    assert chord_lengths(crossings.iloc[:0]).size == 0
+    np.testing.assert_allclose(lit_lengths(crossings), [7.0, 3.0])
+    assert lit_lengths(crossings.iloc[:0]).size == 0
 
 
 # --- blinks and maps --------------------------------------------------------------------------------------------

@@ -11,11 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from analysis.compare import deviation
 from analysis.figures.values import Entry, Isotropy, Measured
 from analysis.report import write
 from analysis.report.result import ReportError
 from analysis.report.tables import provenance_of, tables_of
-from analysis.report.verdict import decided_at, deviation, lines_to_tell_apart, verdict_of
+from analysis.report.verdict import decided_at, lines_to_tell_apart, verdict_of
 from analysis.report.words import count, decimals_for, p_value, percent, plus_minus, probability, signed
 from analysis.report.write import ReportFileError, render_report, write_report
 from tests.analysis import sample_session as sample
@@ -289,13 +290,13 @@ def test_chance_of_a_deviation_is_uniform_for_an_unbiased_robot():
     exact = Entry("Square", 784.0, 112.0, np.array([[9.0e4, 3.0e3], [3.0e3, 1.4e3]]))
     n = 50
     draws = rng.multivariate_normal([784.0, 112.0], exact.covariance_per_line / n, 4000)
-    chances = [deviation(Measured(n, area, perimeter, np.eye(2)), exact).chance for area, perimeter in draws]
+    chances = [deviation(Measured(n, area, perimeter, np.eye(2)), exact).p_value for area, perimeter in draws]
     np.testing.assert_allclose(np.quantile(chances, [0.1, 0.5, 0.9]), [0.1, 0.5, 0.9], atol=0.03)
     off = deviation(Measured(n, 784.0 + 3 * math.sqrt(9.0e4 / n), 112.0, np.eye(2)), exact)
-    assert off.area_sigmas == pytest.approx(3.0)
-    assert off.perimeter_sigmas == 0.0
+    assert off.z_area == pytest.approx(3.0)
+    assert off.z_perimeter == 0.0
     assert math.isnan(
-        deviation(Measured(n, 700.0, 100.0, np.eye(2)), replace(exact, covariance_per_line=np.zeros((2, 2)))).chance
+        deviation(Measured(n, 700.0, 100.0, np.eye(2)), replace(exact, covariance_per_line=np.zeros((2, 2)))).p_value
     )
 
 
