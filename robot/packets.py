@@ -7,21 +7,19 @@ are escaped as ``AB 23``, ``AB 05`` and ``AB 50``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import IntFlag
+from typing import NamedTuple
 
 from lab.base.errors import RequestError
 
 START = 0x8D
 END = 0xD8
 ESCAPE = 0xAB
-# An escaped byte is its value with the bits of this mask off.
-_ESCAPE_MASK = 0x88
-_ESCAPED = {byte & ~_ESCAPE_MASK: byte for byte in (START, END, ESCAPE)}
+_START, _END = bytes((START,)), bytes((END,))
 NOTIFICATION_SEQ = 0xFF
 """Robots number their notifications with it, so no request may carry it."""
 MAX_FRAME_BYTES = 2048
-"""No frame is longer: a start without an end is garbage once it is."""
+"""No frame is longer, up to its end byte: what is, is garbage from there on."""
 
 
 class Flag(IntFlag):
@@ -37,11 +35,17 @@ class Flag(IntFlag):
 
 
 _RESPONSE, _TARGET, _SOURCE, _EXTENDED = 0x01, 0x10, 0x20, 0x80
+# By FLAGS: bytes from FLAGS to CHK of a frame without data. No known robot extends its flags: more than any frame has.
+_LEAST_BYTES = tuple(
+    MAX_FRAME_BYTES if flags & _EXTENDED else 5 + sum(bool(flags & bit) for bit in (_RESPONSE, _TARGET, _SOURCE))
+    for flags in range(0x100)
+)
 
 
-@dataclass(frozen=True, slots=True)
-class Packet:
+class Packet(NamedTuple):
     """One frame's content, escapes and checksum taken off.
+
+    A tuple, since one is made for every notification, in a quarter of the time of a frozen dataclass.
 
     ``target`` (TID), ``source`` (SID) and ``error`` are None where the flags say that they are absent;
     ``data`` is the payload.
@@ -102,11 +106,12 @@ class PacketParser:
     """Takes a byte stream cut anywhere and gives back its frames.
 
     Frames may come a byte at a time or several glued together. What is no frame is dropped and counted,
-    and the next good frame is found at the next start byte.
+    and the next good frame is found at the next start byte. Neither the frames nor the counts depend on
+    where the stream is cut, and no more than ``MAX_FRAME_BYTES`` are kept between two calls.
 
     Attributes:
         bad_checksums: Frames dropped because their checksum did not fit.
-        malformed: Frames dropped because they were too short, too long or wrongly escaped.
+        malformed: Frames dropped because they were cut short, too short, too long or wrongly escaped.
         garbage_bytes: Bytes dropped because they stood outside any frame.
     """
 
@@ -114,51 +119,67 @@ class PacketParser:
         self.bad_checksums = 0
         self.malformed = 0
         self.garbage_bytes = 0
-        self._buffer = bytearray()
+        # From its start byte on; no other delimiter is in it.
+        self._open = b""
 
     def feed(self, chunk: bytes | bytearray) -> list[Packet]:
         """Add what has arrived; return the frames that it completes, in order."""
-        buffer = self._buffer
-        buffer += chunk
         packets: list[Packet] = []
-        begin = 0
-        while True:
-            start = buffer.find(START, begin)
-            if start < 0:
-                self.garbage_bytes += len(buffer) - begin
-                buffer.clear()
-                return packets
-            self.garbage_bytes += start - begin
-            end = buffer.find(END, start)
-            # A start byte inside a frame is never escaped data: the frame before it was cut short.
-            again = buffer.find(START, start + 1, end if end >= 0 else len(buffer))
-            if again >= 0:
-                self.malformed += 1
-                begin = again
-                continue
-            if end < 0:
-                if len(buffer) - start > MAX_FRAME_BYTES:
-                    self.malformed += 1
-                    buffer.clear()
-                else:
-                    del buffer[:start]
-                return packets
-            packet = self._decode(buffer[start + 1 : end])
-            if packet is not None:
-                packets.append(packet)
-            begin = end + 1
+        if END in chunk:
+            # Delimiters are never escaped data, so each end byte ends whatever began last before it.
+            *closed, chunk = (self._open + chunk).split(_END)
+            self._open = b""
+            for piece in closed:
+                before, start, body = piece.rpartition(_START)
+                if before:
+                    self._skip(before)
+                if not start:
+                    self.garbage_bytes += len(body) + 1
+                elif len(body) >= MAX_FRAME_BYTES:
+                    self._break_off(len(body) + 1)
+                    self.garbage_bytes += 1
+                elif (packet := self._decode(body)) is not None:
+                    packets.append(packet)
+        if chunk:
+            self._keep(chunk)
+        return packets
 
-    def _decode(self, body: bytearray) -> Packet | None:
+    def _keep(self, chunk: bytes | bytearray) -> None:
+        """Hold on to a frame that has not ended yet."""
+        if START in chunk:
+            before, start, body = (self._open + chunk).rpartition(_START)
+            self._skip(before)
+            self._open = start + body
+        elif self._open:
+            self._open += chunk
+        else:
+            self.garbage_bytes += len(chunk)
+        if len(self._open) > MAX_FRAME_BYTES:
+            self._break_off(len(self._open))
+            self._open = b""
+
+    def _skip(self, before: bytes) -> None:
+        """Count what stood before a start byte: garbage, then frames that were cut short."""
+        garbage, *broken = before.split(_START)
+        self.garbage_bytes += len(garbage)
+        for body in broken:
+            self._break_off(len(body) + 1)
+
+    def _break_off(self, length: int) -> None:
+        self.malformed += 1
+        self.garbage_bytes += max(0, length - MAX_FRAME_BYTES)
+
+    def _decode(self, body: bytes) -> Packet | None:
         """The packet between two delimiters, or None after counting why not."""
         if ESCAPE in body:
-            plain = _unescape(body)
-            if plain is None:
+            # The escape of the escape byte last: only then does none of the others' bytes come to stand for one.
+            body = body.replace(b"\xab\x05", b"\x8d").replace(b"\xab\x50", b"\xd8")
+            if body.count(b"\xab") != body.count(b"\xab\x23"):
                 self.malformed += 1
                 return None
-            body = plain
-        flags = body[0] if body else 0
-        least = 5 + bool(flags & _TARGET) + bool(flags & _SOURCE) + bool(flags & _RESPONSE)
-        if len(body) < least or flags & _EXTENDED:
+            body = body.replace(b"\xab\x23", b"\xab")
+        flags = body[0] if body else _EXTENDED
+        if len(body) < _LEAST_BYTES[flags]:
             self.malformed += 1
             return None
         if sum(body) & 0xFF != 0xFF:
@@ -172,22 +193,8 @@ class PacketParser:
         if flags & _SOURCE:
             source = body[at]
             at += 1
-        did, cid, seq = body[at : at + 3]
-        at += 3
+        data_at = at + 3
         if flags & _RESPONSE:
-            error = body[at]
-            at += 1
-        return Packet(flags, did, cid, seq, bytes(body[at:-1]), target, source, error)
-
-
-def _unescape(body: bytearray) -> bytearray | None:
-    """Take the escapes off, or None when an escape byte is followed by none of the three codes."""
-    first, *rest = body.split(b"\xab")
-    plain = bytearray(first)
-    for part in rest:
-        byte = _ESCAPED.get(part[0]) if part else None
-        if byte is None:
-            return None
-        plain.append(byte)
-        plain += part[1:]
-    return plain
+            error = body[data_at]
+            data_at += 1
+        return Packet(flags, body[at], body[at + 1], body[at + 2], body[data_at:-1], target, source, error)

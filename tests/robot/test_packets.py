@@ -3,6 +3,8 @@ from __future__ import annotations
 import itertools
 import math
 import struct
+import sys
+from collections.abc import Iterable
 
 import pytest
 from hypothesis import given, settings
@@ -172,6 +174,68 @@ def test_one_damaged_byte_is_never_taken_for_the_packet(packet: Packet, data: st
     assert received[-1] == packet
     assert packet not in received[:-1]
     assert parser.bad_checksums + parser.malformed + parser.garbage_bytes > 0 or len(received) == 1
+
+
+def read(pieces: Iterable[bytes]) -> tuple[list[Packet], tuple[int, int, int]]:
+    parser = PacketParser()
+    received = [packet for piece in pieces for packet in parser.feed(piece)]
+    return received, (parser.bad_checksums, parser.malformed, parser.garbage_bytes)
+
+
+# Longer than any frame may be, with and without what could end it.
+overlong = st.builds(
+    lambda head, size, tail: head + bytes(size) + tail,
+    st.sampled_from([b"", b"\x8d", b"\xd8\x8d", b"\x8d\x0a\x8d"]),
+    st.integers(MAX_FRAME_BYTES - 3, 2 * MAX_FRAME_BYTES + 2),
+    st.sampled_from([b"", b"\xd8", b"\x8d", b"\x00\xd8"]),
+)
+
+
+@given(
+    st.lists(st.one_of(awkward, packets().map(encode), overlong), max_size=5),
+    st.lists(st.integers(0, 10_000), max_size=20),
+)
+def test_neither_packets_nor_counts_depend_on_where_the_stream_is_cut(parts: list[bytes], places: list[int]) -> None:
+    stream = b"".join(parts) + b"\xd8"
+    assert read(cut(stream, places)) == read([stream]) == read(bytes([value]) for value in stream)
+
+
+@given(packets(), packets(), st.data())
+def test_a_frame_cut_short_costs_itself_alone(broken: Packet, good: Packet, data: st.DataObject) -> None:
+    """The next start byte may stand anywhere in it, even behind an escape byte."""
+    frame = encode(broken)
+    short = frame[: data.draw(st.integers(1, len(frame) - 1))]
+    received, (_, malformed, garbage) = read([short + encode(good)])
+    assert (received, malformed, garbage) == ([good], 1, 0)
+
+
+@given(packets(), packets(), st.data())
+def test_a_delimiter_inside_a_frame_costs_that_frame_alone(broken: Packet, good: Packet, data: st.DataObject) -> None:
+    frame = bytearray(encode(broken))
+    frame.insert(data.draw(st.integers(1, len(frame) - 1)), data.draw(st.sampled_from([0x8D, 0xD8])))
+    received, counts = read([bytes(frame) + encode(good)])
+    assert received[-1] == good
+    assert sum(counts) > 0 or received[:-1] == [broken]
+
+
+@pytest.mark.parametrize("garbage", [b"\x00", b"\x8d", b"\xd8", b"\xab", b"\x8d" + bytes(63), bytes(range(0x8E, 0xD0))])
+def test_endless_garbage_takes_no_memory(garbage: bytes) -> None:
+    parser = PacketParser()
+    parser.feed(b"\x8d")
+    for _ in range(20_000):
+        assert parser.feed(garbage) == []
+        assert sum(map(sys.getsizeof, vars(parser).values())) < MAX_FRAME_BYTES + 300
+    good = Packet(0x0A, 0x13, 0x0D, 0)
+    assert parser.feed(encode(good)) == [good]
+
+
+@pytest.mark.parametrize(("size", "fits"), [(MAX_FRAME_BYTES - 6, True), (MAX_FRAME_BYTES - 5, False)])
+def test_a_frame_may_be_so_long_and_no_longer(size: int, fits: bool) -> None:
+    """Six bytes beside the data, the end byte not counted."""
+    packet = Packet(0x0A, 0x10, 0x00, 0, bytes(size))
+    frame = encode(packet)
+    assert len(frame) == size + 7
+    assert read([frame]) == (([packet], (0, 0, 0)) if fits else ([], (0, 1, 2)))
 
 
 def test_what_is_dropped_is_counted() -> None:
