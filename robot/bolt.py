@@ -7,41 +7,48 @@ import contextlib
 import logging
 import math
 from collections.abc import Callable, Coroutine
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
 from bleak.backends.client import BaseBleakClient
 from bleak.backends.scanner import BaseBleakScanner
 
-from robot import commands
+from robot import commands, status
+from robot.backoff import persist
 from robot.collision import wall_normal_heading
-from robot.commands import Collision, Request
-from robot.device import Bump, Identity, Sample
-from robot.errors import DriveError, PayloadError, RobotError
+from robot.commands import BatteryState, ChargerState, Collision, Colour, Request
+from robot.device import Attitude, Bump, Identity, Sample
+from robot.errors import CommandError, DriveError, LinkLostError, PayloadError, ReplyTimeoutError, RobotError
 from robot.link import Heard, Link, scan
 from robot.packets import Packet
 from robot.profile import RobotProfile
+from robot.stream import OFF, Stream
+from robot.tending import Tending
 
 __all__ = ["Bolt", "Heard", "scan"]
 
 _log = logging.getLogger(__name__)
 
-# Locator for the way, velocity for the speed, light for the crossings: one frame of 28 bytes without escapes.
-_STREAM = commands.layout_for("locator_x_m", "locator_y_m", "velocity_x_m_s", "velocity_y_m_s", "ambient_lux")
 _SENSOR_DATA = commands.SENSOR_DATA.key
 _COLLISION = commands.COLLISION.key
-_CM_PER_M = 100.0
 _COLLISION_METHOD = 1
 _FAREWELL_TIMEOUT_S = 2.0
-# Who waits for a deadline sleeps at least this long, far above what an event loop may wake it early by: else
-# it could find the deadline a rounding ahead for ever, in turns that take no virtual time.
-_LEAST_NAP_S = 0.001
+_HALT_TIMEOUT_S = 1.0
+# Braking and half a turn on the spot take about a second.
+_AIM_S = 2.0
+_AIMING: Colour = (0, 0, 255)
+_DARK: Colour = (0, 0, 0)
+_STABILISED = Request(commands.STABILISATION, commands.STABILISATION.payload(commands.STABILISE_FULL))
+_MOTORS_OFF = commands.raw_motors(0, 0)
+_UNSTABILISED = Request(commands.STABILISATION, commands.STABILISATION.payload(commands.STABILISE_NONE))
 
 
 class Bolt:
     """A Sphero BOLT as a ``RobotDevice``.
 
     While it rolls, a task repeats the drive command: a BOLT that hears nothing stops by itself, so it
-    stops when this program does. Others keep it awake and watch over the stream.
+    stops when this program does. Others keep it awake and watch over the stream. As a context manager it is
+    connected on the way in, and stopped and let go on every way out.
 
     Args:
         name: Advertised name, "SB-" and four hexadecimal digits.
@@ -51,8 +58,9 @@ class Bolt:
 
     Attributes:
         on_sample: Called for each streamed sample.
+        on_attitude: Called for each frame of a stream that carries the attitude, before ``on_sample``.
         on_bump: Called for each wall that the robot runs into.
-        on_lost: Called once when the link breaks unasked, with the reason.
+        on_lost: Called once a connection when the link breaks unasked, with the reason.
     """
 
     def __init__(
@@ -66,25 +74,40 @@ class Bolt:
         self.name = name
         self.profile = profile if profile is not None else RobotProfile()
         self.on_sample: Callable[[Sample], None] | None = None
+        self.on_attitude: Callable[[Attitude], None] | None = None
         self.on_bump: Callable[[Bump], None] | None = None
         self.on_lost: Callable[[str], None] | None = None
         self._link = Link(name, self.profile, backend=backend, scanner_backend=scanner_backend)
         self._link.on_notification = self._notified
         self._link.on_lost = self._lost
+        self._tending = Tending(name, self._link, self.profile)
+        self._wanted = False
         self._heading_rad = 0.0
         self._facing_rad = 0.0
-        self._speed_units = 0
-        self._driving = asyncio.Lock()
-        self._refresh_at_s = math.inf
-        self._last_sample_s = math.inf
-        self._tenders: tuple[asyncio.Task[None], ...] = ()
+        self._raw: Request | None = None
+        self._stream: Stream | None = None
+        self._led_level: float | None = None
         self._errands: set[asyncio.Task[None]] = set()
         self._now_s: Callable[[], float] = float
+
+    async def __aenter__(self) -> Self:
+        await self.connect()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.disconnect()
 
     @property
     def bad_frames(self) -> int:
         """Frames that arrived damaged since the link was opened."""
         return self._link.parser.bad_checksums + self._link.parser.malformed
+
+    @property
+    def reply_flags(self) -> int | None:
+        """Flags byte of its last answer to a command that names its target; None before the first."""
+        return self._link.reply_flags
 
     async def connect(self) -> None:
         """Find the robot, connect, wake it, and make where it stands and faces its frame.
@@ -94,98 +117,184 @@ class Bolt:
         """
         if self._link.is_open:
             return
-        loop = asyncio.get_running_loop()
-        self._now_s = loop.time
-        self._heading_rad, self._facing_rad, self._speed_units = 0.0, 0.0, 0
-        self._refresh_at_s = self._last_sample_s = math.inf
-        await self._link.open()
-        threshold = self.profile.collision_threshold
-        setup = (
-            Request(commands.WAKE),
-            commands.stream(0, 0),
-            Request(commands.STABILISATION, commands.STABILISATION.payload(commands.STABILISE_FULL)),
-            Request(commands.RESET_YAW),
-            # 0: the locator's axes stay where the yaw was reset, and do not turn with later resets.
-            Request(commands.LOCATOR_FLAGS, commands.LOCATOR_FLAGS.payload(0)),
-            Request(commands.RESET_LOCATOR),
-            commands.collision_setup(
-                _COLLISION_METHOD, (threshold, threshold, threshold, threshold), self.profile.collision_dead_s
-            ),
-        )
+        self._stream, self._led_level = None, None
+        self._heading_rad, self._facing_rad, self._raw = 0.0, 0.0, None
+        self._wanted = True
+        await self._open(again=False)
+
+    async def reconnect(self, give_up_s: float = 60.0) -> int:
+        """Win a lost robot back: stopped before anything else, then streaming and lit as it was.
+
+        Its frame is a new one, as after ``connect``: where it stands and faces then. Between two attempts
+        there is a pause, 0.5 s at first and twice as long each time up to 8 s. Cancelled, it leaves nothing
+        connected and nothing running.
+
+        Args:
+            give_up_s: No attempt goes on, or is begun, after this long.
+
+        Returns:
+            How many attempts it took; 0 when the link is there.
+
+        Raises:
+            ReconnectError: It did not come back, or ``disconnect`` was called meanwhile.
+            DriveError: ``give_up_s`` is no time.
+        """
+        if self._link.is_open:
+            return 0
+        self._wanted = True
+        return await persist(self.name, lambda: self._open(again=True), give_up_s, lambda: self._wanted)
+
+    async def _open(self, *, again: bool) -> None:
+        """Connect and set the robot up; with ``again``, stop it first and take up what it did before."""
+        self._now_s = asyncio.get_running_loop().time
+        # The link before may still be closing.
+        await self._settle()
         try:
-            for request in setup:
-                await self._link.ask(request)
+            self._check(self._wanted, "it was let go meanwhile")
+            await self._link.open()
+            self._check(self._wanted, "it was let go meanwhile")
+            if again:
+                # One that sleeps refuses, or does not answer, before it has been woken.
+                with contextlib.suppress(CommandError, ReplyTimeoutError):
+                    await self._halt()
+            await self._link.ask(Request(commands.WAKE))
+            if again:
+                await self._halt()
+            await self._set_up()
+            if again and self._stream is not None:
+                await self._begin_stream(self._stream)
+            if again and self._led_level is not None:
+                await self.set_led(self._led_level)
+            # Nobody would be told of a link that broke just after the last answer.
+            self._check(self._link.is_open, "it broke while it was set up")
         except BaseException:
             # Also when cancelled: a robot half set up must not stay connected.
+            self._tending.dismiss()
             await self._link.close()
             raise
-        self._tenders = (
-            loop.create_task(self._tend(), name=f"tend {self.name}"),
-            loop.create_task(self._watch(), name=f"watch {self.name}"),
-        )
+        self._tending.start()
+
+    def _check(self, holds: bool, otherwise: str) -> None:
+        if not holds:
+            raise LinkLostError(self.name, otherwise)
+
+    async def _halt(self) -> None:
+        """Come to rest, without the patience for a robot that is known to listen."""
+        if self._raw is not None:
+            await self._link.ask(_MOTORS_OFF, timeout_s=_HALT_TIMEOUT_S)
+        await self._link.ask(commands.drive(0, self._heading_rad), timeout_s=_HALT_TIMEOUT_S)
+
+    async def _set_up(self) -> None:
+        """Bring a robot that is awake into the state that this driver counts on."""
+        await self._link.ask(OFF)
+        await self._link.ask(_STABILISED)
+        self._raw = None
+        # 0: the locator's y axis stays along heading 0 when the yaw is reset, now and by ``aim``.
+        await self._link.ask(Request(commands.LOCATOR_FLAGS, commands.LOCATOR_FLAGS.payload(0)))
+        await self._take_frame()
+        threshold = self.profile.collision_threshold
+        thresholds = (threshold, threshold, threshold, threshold)
+        await self._link.ask(commands.collision_setup(_COLLISION_METHOD, thresholds, self.profile.collision_dead_s))
+
+    async def _take_frame(self) -> None:
+        """Make where the robot stands and faces its frame."""
+        await self._link.ask(Request(commands.RESET_YAW))
+        self._heading_rad = self._facing_rad = 0.0
+        await self._link.ask(Request(commands.RESET_LOCATOR))
 
     async def disconnect(self) -> None:
         """Stop the robot, dark its matrix, and let it go. Does nothing when it is not connected."""
-        tenders = self._dismiss()
-        if tenders:
-            await asyncio.wait(tenders, timeout=_FAREWELL_TIMEOUT_S)
-        self._refresh_at_s = self._last_sample_s = math.inf
+        self._wanted = False
+        tasks = self._tending.dismiss()
         try:
+            if tasks:
+                await asyncio.wait(tasks, timeout=_FAREWELL_TIMEOUT_S)
             if self._link.is_open:
                 # The robot stops by itself in the end, so a farewell that fails loses nothing.
                 with contextlib.suppress(RobotError, TimeoutError):
                     async with asyncio.timeout(_FAREWELL_TIMEOUT_S):
                         await self.stop()
-                        await self._link.ask(commands.stream(0, 0))
-                        await self._link.ask(commands.matrix_colour(0, 0, 0))
+                        await self._link.ask(OFF)
+                        await self._link.ask(commands.matrix_colour(*_DARK))
         finally:
+            self._tending.dismiss()
             await self._link.close()
-            if self._errands:
-                _, late = await asyncio.wait(self._errands, timeout=_FAREWELL_TIMEOUT_S)
-                for errand in late:
-                    errand.cancel()
+            await self._settle()
 
     async def identity(self) -> Identity:
         """Name, address, firmware and battery."""
-        (digits,) = commands.MAC_ADDRESS.decode(await self._link.ask(Request(commands.MAC_ADDRESS)))
-        version = commands.MAIN_APP_VERSION.decode(await self._link.ask(Request(commands.MAIN_APP_VERSION)))
-        text = bytes(digits).decode("ascii", errors="replace").upper()
-        return Identity(
-            name=self.name,
-            address=":".join(text[i : i + 2] for i in range(0, 12, 2)),
-            firmware=".".join(str(part) for part in version),
-            battery_v=await self.battery_v(),
-        )
+        return await status.identity(self._link)
 
     async def battery_v(self) -> float:
         """Battery voltage, V."""
-        (hundredths,) = commands.BATTERY_VOLTAGE.decode(await self._link.ask(Request(commands.BATTERY_VOLTAGE)))
-        return hundredths / 100.0
+        return await status.battery_v(self._link)
+
+    async def battery_state(self) -> BatteryState:
+        """Whether the robot finds its battery fine, low or critical."""
+        return await status.battery_state(self._link)
+
+    async def charger_state(self) -> ChargerState:
+        """Whether it stands on the charger, and is full."""
+        return await status.charger_state(self._link)
 
     async def drive(self, heading_rad: float, speed_cm_s: float) -> None:
         """Roll along ``heading_rad`` (sent as a whole degree) at ``speed_cm_s`` until told otherwise.
+
+        A newer ``drive``, ``stop`` or ``raw_motors`` before the robot has answered takes its place.
 
         Raises:
             DriveError: The speed or heading is out of reach.
             RobotError: The robot refuses or is gone.
         """
-        await self._drive(heading_rad, self.profile.speed_units(speed_cm_s))
+        await self._roll(heading_rad, self.profile.speed_units(speed_cm_s))
 
     async def stop(self) -> None:
         """Come to rest, facing as before."""
-        await self._drive(self._heading_rad, 0)
+        await self._roll(self._heading_rad, 0)
 
-    async def _drive(self, heading_rad: float, speed_units: int) -> None:
-        request = commands.drive(speed_units, heading_rad)
-        # Set before the wait, so that a repeat that waits for the lock does not undo this.
-        self._heading_rad, self._speed_units = heading_rad, speed_units
-        self._refresh_at_s = math.inf
-        async with self._driving:
-            await self._link.ask(request)
+    async def _roll(self, heading_rad: float, speed_units: int) -> None:
+        request, raw = commands.drive(speed_units, heading_rad), self._raw
+        self._heading_rad = heading_rad
+        before = () if raw is None else (_MOTORS_OFF, _STABILISED)
+        if await self._tending.move(request, lasts=speed_units > 0, before=before):
             # Only now: a bump reported before this came from the heading before.
             self._facing_rad = math.radians(round(math.degrees(heading_rad)) % 360)
-            if self._speed_units > 0:
-                self._refresh_at_s = self._now_s() + self.profile.refresh_s
+            if self._raw is raw:
+                self._raw = None
+
+    async def raw_motors(self, left: int, right: int) -> None:
+        """Power the motors, each from -255 (back) to 255, without balance, until ``drive`` or ``stop``.
+
+        Nothing tells where the robot heads then: the normals of bumps count from its last heading, which it
+        faces again when it is stopped.
+
+        Raises:
+            DriveError: A power is outside that.
+            RobotError: The robot refuses or is gone.
+        """
+        request = commands.raw_motors(left, right)
+        # Before the answer: once it is sent, the robot may have lost its balance.
+        self._raw = request
+        await self._tending.move(request, lasts=left != 0 or right != 0, before=(_UNSTABILISED,))
+
+    async def aim(self, heading_rad: float) -> None:
+        """Face ``heading_rad`` on the spot and make that forward: headings, bumps and way count from it afterwards.
+
+        The back LED is blue meanwhile, so that who stands behind the robot sees its back.
+
+        Raises:
+            DriveError: The heading is not finite.
+            RobotError: The robot refuses or is gone.
+        """
+        commands.drive(0, heading_rad)  # refuses before the light is on
+        try:
+            await self.set_lights(back=_AIMING)
+            await self._roll(heading_rad, 0)
+            await asyncio.sleep(_AIM_S)
+            await self._take_frame()
+        finally:
+            with contextlib.suppress(RobotError):
+                await self._link.ask(commands.lights(None, _DARK), timeout_s=_FAREWELL_TIMEOUT_S)
 
     async def set_led(self, level: float) -> None:
         """Light the whole matrix red at ``level`` from 0 (off) to 1 (full).
@@ -196,25 +305,55 @@ class Bolt:
         if not 0 <= level <= 1:
             raise DriveError(f"an LED level of {level:g} does not exist: ask for 0 to 1", value=level)
         await self._link.ask(commands.matrix_colour(round(255 * level), 0, 0))
+        self._led_level = level
 
-    async def start_stream(self, interval_s: float) -> None:
-        """Deliver a ``Sample`` every ``interval_s`` (whole milliseconds) to ``on_sample``.
+    async def set_pixel(self, column: int, row: int, colour: Colour) -> None:
+        """Light one pixel of the matrix, columns and rows 0 to 7; ``reconnect`` does not restore it.
 
         Raises:
-            DriveError: The interval is not 1 ms to 65 s.
+            DriveError: There is no such pixel or colour.
         """
-        interval_ms = round(interval_s * 1000) if math.isfinite(interval_s) else 0
-        if not 1 <= interval_ms <= 0xFFFF:
-            raise DriveError(f"a stream every {interval_s:g} s is impossible: ask for 0.001 to 65 s", value=interval_s)
-        await self._link.ask(commands.stream(0, 0))
-        await self._link.ask(commands.stream_extended(_STREAM.extended))
-        await self._link.ask(commands.stream(interval_ms, _STREAM.primary))
-        self._last_sample_s = self._now_s()
+        await self._link.ask(commands.matrix_pixel(column, row, colour))
+
+    async def set_lights(self, front: Colour | None = None, back: Colour | None = None) -> None:
+        """Colour the front and the back LED; None leaves one as it is. ``reconnect`` does not restore them.
+
+        Raises:
+            DriveError: There is no such colour.
+        """
+        if front is not None or back is not None:
+            await self._link.ask(commands.lights(front, back))
+
+    async def start_stream(self, interval_s: float, *, attitude: bool = False) -> None:
+        """Deliver a ``Sample`` every ``interval_s`` (whole milliseconds) to ``on_sample``.
+
+        Args:
+            interval_s: At least the profile's ``least_interval_s``.
+            attitude: Whether to deliver an ``Attitude`` to ``on_attitude`` too.
+
+        Raises:
+            DriveError: The interval is not what the link holds.
+        """
+        profile = self.profile
+        await self._begin_stream(
+            Stream.every(interval_s, profile.least_interval_s, attitude=attitude, locator_scale=profile.locator_scale)
+        )
+
+    async def _begin_stream(self, stream: Stream) -> None:
+        self._tending.expect_samples(math.inf)
+        off, *chosen = stream.requests
+        await self._link.ask(off)
+        # Frames of the stream before were answered for by now.
+        self._stream = stream
+        for request in chosen:
+            await self._link.ask(request)
+        self._tending.expect_samples(stream.interval_ms / 1000)
 
     async def stop_stream(self) -> None:
         """Deliver no more samples."""
-        self._last_sample_s = math.inf
-        await self._link.ask(commands.stream(0, 0))
+        self._tending.expect_samples(math.inf)
+        await self._link.ask(OFF)
+        self._stream = None
 
     def _notified(self, packet: Packet) -> None:
         key = (packet.did, packet.cid)
@@ -231,71 +370,30 @@ class Bolt:
             _log.warning("dropped a notification of %s: %s", self.name, error)
 
     def _sampled(self, data: bytes) -> None:
-        x_m, y_m, velocity_x, velocity_y, light_lux = _STREAM.decode(data)
+        if self._stream is None:
+            return
         now_s = self._now_s()
-        if self._last_sample_s < math.inf:
-            self._last_sample_s = now_s
+        sample, attitude = self._stream.read(data, now_s)
+        self._tending.sampled_at(now_s)
+        if attitude is not None and self.on_attitude is not None:
+            self.on_attitude(attitude)
         if self.on_sample is not None:
-            speed_cm_s = _CM_PER_M * math.hypot(velocity_x, velocity_y)
-            self.on_sample(Sample(now_s, light_lux, _CM_PER_M * x_m, _CM_PER_M * y_m, speed_cm_s))
+            self.on_sample(sample)
 
     def _bumped(self, collision: Collision) -> None:
         if self.on_bump is not None:
-            normal_rad = wall_normal_heading(collision.x_g, collision.y_g, self._facing_rad)
+            axes = self.profile.collision_axes
+            normal_rad = wall_normal_heading(collision.x_g, collision.y_g, self._facing_rad, axes)
             self.on_bump(Bump(self._now_s(), normal_rad))
 
     def _lost(self, reason: str) -> None:
-        self._refresh_at_s = self._last_sample_s = math.inf
-        self._speed_units = 0
         self._spawn(self._link.close())
         # A link that breaks while it is being set up fails ``connect`` instead.
-        if self._dismiss():
+        if self._tending.dismiss():
             if self.on_lost is not None:
                 self.on_lost(reason)
             else:
                 _log.error("lost the link to %s: %s", self.name, reason)
-
-    def _dismiss(self) -> tuple[asyncio.Task[None], ...]:
-        """Cancel the tasks that tend the connection, and return them."""
-        tenders, self._tenders = self._tenders, ()
-        for tender in tenders:
-            tender.cancel()
-        return tenders
-
-    async def _tend(self) -> None:
-        """Repeat the drive command and keep the robot awake."""
-        profile = self.profile
-        while self._link.is_open:
-            try:
-                if self._now_s() >= self._refresh_at_s:
-                    await self._repeat()
-                elif self._now_s() >= self._link.last_write_s + profile.keep_alive_s:
-                    await self._link.ask(Request(commands.PING))
-            except RobotError as error:
-                self._link.fail(str(error))
-                return
-            next_s = min(self._link.last_write_s + profile.keep_alive_s, self._refresh_at_s)
-            # At most half a refresh, so that a drive begun meanwhile is seen in time.
-            nap_s = min(next_s - self._now_s(), profile.refresh_s / 2)
-            await asyncio.sleep(max(_LEAST_NAP_S, nap_s))
-
-    async def _watch(self) -> None:
-        """Take a link whose stream has fallen silent for lost."""
-        silence_s = self.profile.silence_s
-        while self._link.is_open:
-            quiet_at_s = self._last_sample_s + silence_s
-            if self._now_s() >= quiet_at_s:
-                self._link.fail(f"no sample for {silence_s:g} s")
-                return
-            await asyncio.sleep(max(_LEAST_NAP_S, min(silence_s / 2, quiet_at_s - self._now_s())))
-
-    async def _repeat(self) -> None:
-        """Send the drive command once more, unless a newer one is on its way."""
-        async with self._driving:
-            if self._now_s() >= self._refresh_at_s:
-                await self._link.ask(commands.drive(self._speed_units, self._heading_rad))
-                if self._refresh_at_s < math.inf:
-                    self._refresh_at_s = self._now_s() + self.profile.refresh_s
 
     async def _ping(self) -> None:
         try:
@@ -308,3 +406,10 @@ class Bolt:
         task = asyncio.get_running_loop().create_task(errand)
         self._errands.add(task)
         task.add_done_callback(self._errands.discard)
+
+    async def _settle(self) -> None:
+        """Let the errands of the connection before end, and end those that are late."""
+        if self._errands:
+            _, late = await asyncio.wait(self._errands, timeout=_FAREWELL_TIMEOUT_S)
+            for errand in late:
+                errand.cancel()

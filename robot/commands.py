@@ -10,6 +10,7 @@ import math
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import IntEnum
 from types import MappingProxyType
 from typing import Any
 
@@ -140,6 +141,28 @@ GYRO_MAX = Command("gyro max", 0x18, 0x10, reply="B")
 COLLISION = Command("collision", 0x18, 0x12, reply="hhhBhhhBI")
 
 STABILISE_NONE, STABILISE_FULL = 0, 1
+MATRIX_SIDE = 8
+_MOTOR_OFF, _MOTOR_FORWARD, _MOTOR_REVERSE = 0, 1, 2
+_MOST = 255
+
+Colour = tuple[int, int, int]
+"""Red, green and blue, each 0 to 255."""
+
+
+class BatteryState(IntEnum):
+    """What the robot thinks of its battery."""
+
+    OK = 1
+    LOW = 2
+    CRITICAL = 3
+
+
+class ChargerState(IntEnum):
+    """What the charger does."""
+
+    NOT_CHARGING = 1
+    CHARGING = 2
+    CHARGED = 3
 
 
 def drive(speed_units: int, heading_rad: float, *, flags: int = 0) -> Request:
@@ -153,15 +176,70 @@ def drive(speed_units: int, heading_rad: float, *, flags: int = 0) -> Request:
     return Request(DRIVE, DRIVE.payload(speed_units, round(math.degrees(heading_rad)) % 360, flags))
 
 
+def raw_motors(left: int, right: int) -> Request:
+    """Power the motors, each from -255 (full speed back) to 255.
+
+    Raises:
+        DriveError: A power is outside that.
+    """
+    for power in (left, right):
+        if not -_MOST <= power <= _MOST:
+            raise DriveError(f"a motor power of {power} does not exist: ask for -255 to 255", value=power)
+    return Request(RAW_MOTORS, RAW_MOTORS.payload(_motor_mode(left), abs(left), _motor_mode(right), abs(right)))
+
+
+def _motor_mode(power: int) -> int:
+    if power == 0:
+        return _MOTOR_OFF
+    return _MOTOR_FORWARD if power > 0 else _MOTOR_REVERSE
+
+
 def matrix_colour(red: int, green: int, blue: int) -> Request:
-    """Light the whole matrix in one colour."""
-    return Request(MATRIX_COLOUR, MATRIX_COLOUR.payload(red, green, blue))
+    """Light the whole matrix in one colour.
+
+    Raises:
+        DriveError: A level is outside 0 to 255.
+    """
+    return Request(MATRIX_COLOUR, MATRIX_COLOUR.payload(*_levels((red, green, blue))))
+
+
+def matrix_pixel(column: int, row: int, colour: Colour) -> Request:
+    """Light one pixel of the matrix, columns and rows 0 to 7.
+
+    Raises:
+        DriveError: There is no such pixel, or a level is outside 0 to 255.
+    """
+    for place in (column, row):
+        if not 0 <= place < MATRIX_SIDE:
+            raise DriveError(f"pixel ({column}, {row}) is off the matrix: ask for 0 to 7 each", value=place)
+    return Request(MATRIX_PIXEL, MATRIX_PIXEL.payload(column, row, *_levels(colour)))
 
 
 def leds(levels: Mapping[int, int]) -> Request:
-    """Set LEDs by bit number: 0-2 front RGB, 3-5 back RGB, each 0-255."""
+    """Set LEDs by bit number, the others stay: 0-2 front RGB, 3-5 back RGB, each 0-255.
+
+    Raises:
+        DriveError: A level is outside 0 to 255.
+    """
     mask = sum(1 << bit for bit in levels)
-    return Request(LEDS, bytes([mask, *(levels[bit] for bit in sorted(levels))]))
+    return Request(LEDS, bytes([mask, *_levels(tuple(levels[bit] for bit in sorted(levels)))]))
+
+
+def lights(front: Colour | None, back: Colour | None) -> Request:
+    """Colour the front and the back LED; the mask leaves the one that is None as it is.
+
+    Raises:
+        DriveError: A level is outside 0 to 255.
+    """
+    sides = ((0, front), (3, back))
+    return leds({first + i: level for first, colour in sides if colour for i, level in enumerate(colour)})
+
+
+def _levels(levels: tuple[int, ...]) -> tuple[int, ...]:
+    for level in levels:
+        if not 0 <= level <= _MOST:
+            raise DriveError(f"a light level of {level} does not exist: ask for 0 to 255", value=level)
+    return levels
 
 
 def collision_setup(method: int, thresholds: tuple[int, int, int, int], dead_s: float) -> Request:

@@ -1,8 +1,8 @@
 """What the rest of the lab knows of a robot: one Protocol and the records that cross it.
 
 Robot frame: its origin and its forward direction are wherever the robot stood and faced when it was
-connected. Headings are radians, clockwise from forward; x is to the right, y forward, so a heading h
-points along (sin h, cos h).
+connected, or connected again. Headings are radians, clockwise from forward; x is to the right, y
+forward, so a heading h points along (sin h, cos h).
 """
 
 from __future__ import annotations
@@ -25,6 +25,20 @@ class Sample:
     x_cm: float
     y_cm: float
     speed_cm_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Attitude:
+    """How the robot is tilted and turned, by its gyroscope.
+
+    ``t_host_s`` is the event loop's clock when the frame arrived; the angles are the robot's own, about its
+    right-handed axes with z up, so ``yaw_rad`` runs against headings: it is minus the heading, in (-π, π].
+    """
+
+    t_host_s: float
+    pitch_rad: float
+    roll_rad: float
+    yaw_rad: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +68,8 @@ class RobotDevice(Protocol):
     """A robot that rolls straight, feels the wall and streams the light below it.
 
     The three callbacks are called on the event loop, must return quickly and may be set at any time.
-    ``on_lost`` is called at most once per connection, with the reason, and never after ``disconnect``.
+    ``on_lost`` is called at most once per connection, with the reason, and never after ``disconnect``;
+    after a ``reconnect`` it may be called once more.
     """
 
     name: str
@@ -67,6 +82,17 @@ class RobotDevice(Protocol):
 
         Raises:
             RobotError: Bluetooth is off, or the robot is unknown, unreachable or refuses.
+        """
+        ...
+
+    async def reconnect(self, give_up_s: float = 60.0) -> int:
+        """Win a lost robot back: stopped, streaming and lit as before, but in a new frame, as after ``connect``.
+
+        Returns:
+            How many attempts it took; 0 when the link is there.
+
+        Raises:
+            ReconnectError: It did not come back within ``give_up_s``.
         """
         ...
 

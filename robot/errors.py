@@ -33,14 +33,14 @@ class BluetoothUnavailableError(RobotError):
 class RobotNotFoundError(RobotError):
     """No advertisement carried the name within ``timeout_s``; ``seen`` are the robots that were heard.
 
-    A robot that sleeps or is connected elsewhere does not advertise.
+    A robot that sleeps, or that another program or machine holds, does not advertise.
     """
 
     def __init__(self, robot: str, *, timeout_s: float, seen: Sequence[str] = ()) -> None:
         heard = f"heard only {', '.join(sorted(seen))}" if seen else "heard no robot at all"
         super().__init__(
-            f"no robot called {robot} within {timeout_s:g} s ({heard}): take it off the charger or shake it awake, "
-            "close other apps that hold it, or look with `chordlab robot scan`",
+            f"no robot called {robot} within {timeout_s:g} s ({heard}): one that sleeps or is connected elsewhere does "
+            "not advertise, so shake it awake, close other apps that hold it, or look with `chordlab robot scan`",
             robot=robot,
         )
         self.timeout_s = timeout_s
@@ -61,6 +61,19 @@ class RobotUnreachableError(RobotError):
         )
         self.address = address
         self.reason = reason
+
+
+class NotABoltError(RobotError):
+    """What carries the name at ``address`` is another kind of device: it lacks the characteristic ``missing``."""
+
+    def __init__(self, robot: str, *, address: str, missing: str) -> None:
+        super().__init__(
+            f"{robot} ({address}) is no Sphero BOLT (it lacks the characteristic {missing}): "
+            "take a name that `chordlab robot scan` lists",
+            robot=robot,
+        )
+        self.address = address
+        self.missing = missing
 
 
 class NotConnectedError(RobotError):
@@ -84,11 +97,27 @@ class ReplyTimeoutError(RobotError):
 
     def __init__(self, robot: str, command: str, *, timeout_s: float) -> None:
         super().__init__(
-            f"{robot} did not answer `{command}` within {timeout_s:g} s: bring it closer, or wake it and connect again",
+            f"{robot} did not answer `{command}` within {timeout_s:.3g} s: "
+            "bring it closer, or wake it and connect again",
             robot=robot,
         )
         self.command = command
         self.timeout_s = timeout_s
+
+
+class ReconnectError(RobotError):
+    """A lost robot did not come back within ``give_up_s``; ``attempts`` were made, the last failed for ``reason``."""
+
+    def __init__(self, robot: str, *, attempts: int, give_up_s: float, reason: str) -> None:
+        tries = "attempt" if attempts == 1 else "attempts"
+        super().__init__(
+            f"{robot} did not come back in {give_up_s:g} s and {attempts} {tries}: charge it, bring it closer, "
+            f"and connect again; the last one: {reason}",
+            robot=robot,
+        )
+        self.attempts = attempts
+        self.give_up_s = give_up_s
+        self.reason = reason
 
 
 class CommandError(RobotError):
@@ -122,7 +151,7 @@ class RadioError(ChordlabError):
 
 
 class DriveError(RequestError):
-    """A speed, heading or level outside what the robot can do was asked for; ``value`` is what was asked."""
+    """A speed, heading, level or time outside what the robot can do was asked for; ``value`` is what was asked."""
 
     def __init__(self, message: str, *, value: float) -> None:
         super().__init__(message)

@@ -13,7 +13,7 @@ from robot.bolt import Bolt
 from robot.device import Bump, Sample
 from robot.profile import RobotProfile
 from robot.virtual.body import Body, BodySettings
-from robot.virtual.bolt import BoltSettings, VirtualBolt
+from robot.virtual.bolt import BoltSettings, VirtualBolt, body_settings
 from robot.virtual.radio import AirSettings, VirtualRadio
 
 IDEAL = BodySettings(speed_error=0.0, drift_rad_per_cm=0.0, locator_error=0.0, bump_angle_rad=0.0, light_noise_lux=0.0)
@@ -36,18 +36,24 @@ async def _bench(
     air: AirSettings | None = None,
     manners: BoltSettings | None = None,
     profile: RobotProfile | None = None,
+    truth: RobotProfile | None = None,
     physics: BodySettings = IDEAL,
     connect: bool = True,
+    seed: int = 7,
     **body: object,
 ):
-    rng = np.random.default_rng(7)
+    rng = np.random.default_rng(seed)
     radio = VirtualRadio(air, rng=rng)
     await radio.start()
+    physics = physics if truth is None else body_settings(truth, physics)
     reachable = box(-56.35, -41.35, 56.35, 41.35)
     ball = Body(
-        reachable, lambda x, y: np.where(x > 0, 120.0, 20.0), rng, physics, **{"position_cm": (0.0, 0.0), **body}
+        reachable,
+        **{"light_at": lambda x, y: np.where(x > 0, 120.0, 20.0), "position_cm": (0.0, 0.0), **body},
+        rng=rng,
+        settings=physics,
     )
-    virtual = VirtualBolt(radio, ball, "SB-1234", manners)
+    virtual = VirtualBolt(radio, ball, "SB-1234", manners, truth)
     await virtual.start()
     robot = Bolt("SB-1234", backend=radio.client_backend, scanner_backend=radio.scanner_backend, profile=profile)
     bench = Bench(radio, ball, virtual, robot)

@@ -5,45 +5,35 @@ import itertools
 import math
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from lab.base.errors import RequestError
 from lab.clock import run
 from robot import commands
 from robot.bolt import Bolt, scan
-from robot.collision import collision_acceleration, wall_normal_heading
-from robot.commands import Request
-from robot.device import RobotDevice
-from robot.errors import (
-    BluetoothUnavailableError,
-    CommandError,
-    DriveError,
-    LinkLostError,
-    NotConnectedError,
-    ReplyTimeoutError,
-    RobotNotFoundError,
-    RobotUnreachableError,
-)
+from robot.commands import BatteryState, ChargerState, Request
+from robot.device import Attitude, RobotDevice
+from robot.errors import DriveError, NotConnectedError, PayloadError
 from robot.packets import PacketParser
 from robot.profile import RobotProfile
-from robot.virtual.bolt import BoltSettings
 from robot.virtual.radio import AirSettings
 
 
-def drives(bench) -> list[tuple[float, int]]:
-    """Record (time, speed byte) of every drive command that reaches the virtual robot."""
-    seen: list[tuple[float, int]] = []
+def heard_by(bench) -> list:
+    """Every (time, packet) that reaches the virtual robot from now on."""
+    seen: list = []
     firmware = bench.virtual._firmware
     handle = firmware.handle
 
     def spy(packet) -> None:
-        if (packet.did, packet.cid) == commands.DRIVE.key:
-            seen.append((asyncio.get_running_loop().time(), packet.data[0]))
+        seen.append((asyncio.get_running_loop().time(), packet))
         handle(packet)
 
     firmware.handle = spy
     return seen
+
+
+def drives_in(seen) -> list[tuple[float, int]]:
+    """(time, speed byte) of each drive command."""
+    return [(t_s, packet.data[0]) for t_s, packet in seen if (packet.did, packet.cid) == commands.DRIVE.key]
 
 
 def test_a_bolt_is_a_robot() -> None:
@@ -66,6 +56,7 @@ def test_connect_identify_and_let_go(bench) -> None:
             assert await scan(1.0, b.radio.scanner_backend) == []
             await b.robot.disconnect()
             await b.robot.disconnect()
+            await asyncio.sleep(0.1)
             assert not b.virtual.is_connected
             assert len(await scan(1.0, b.radio.scanner_backend)) == 1
             assert b.lost == []
@@ -105,19 +96,19 @@ def test_a_stream_carries_light_way_and_speed(bench, mtu: int) -> None:
 def test_it_keeps_rolling_while_the_host_lives_and_stops_when_told(bench) -> None:
     async def main() -> None:
         async with bench(position_cm=(-50.0, 0.0), facing_rad=0.0) as b:
-            seen = drives(b)
+            seen = heard_by(b)
             await b.robot.drive(0.0, 10.0)
             await asyncio.sleep(8.0)
             assert b.body.distance_cm == pytest.approx(80.0, abs=3.0)
-            gaps = [q - p for (p, _), (q, _) in itertools.pairwise(seen)]
+            gaps = [q - p for (p, _), (q, _) in itertools.pairwise(drives_in(seen))]
             assert max(gaps) <= 0.85
-            assert len(seen) == 10
+            assert len(drives_in(seen)) == 10
             await b.robot.stop()
             await asyncio.sleep(1.0)
             way_cm = b.body.distance_cm
             await asyncio.sleep(5.0)
             assert b.body.distance_cm == way_cm
-            assert [units for _, units in seen[-2:]] == [17, 0]
+            assert [units for _, units in drives_in(seen)[-2:]] == [17, 0]
 
     run(main(), virtual=True)
 
@@ -128,9 +119,9 @@ def test_disconnecting_stops_it(bench) -> None:
             await b.robot.set_led(1.0)
             await b.robot.drive(0.0, 20.0)
             await asyncio.sleep(1.0)
-            seen = drives(b)
+            seen = heard_by(b)
             await b.robot.disconnect()
-            assert seen[-1][1] == 0
+            assert drives_in(seen)[-1][1] == 0
             b.body.advance(asyncio.get_running_loop().time() + 5.0)
             assert b.body.speed_cm_s == 0.0
             assert b.body.led_level == 0.0
@@ -165,117 +156,195 @@ def test_bumps_point_back_into_the_arena(bench) -> None:
     run(main(), virtual=True)
 
 
-@given(normal=st.floats(0, 6.28), heading=st.floats(0, 6.28), size=st.floats(0.01, 8))
-def test_the_two_readings_of_a_collision_agree(normal: float, heading: float, size: float) -> None:
-    x_g, y_g = collision_acceleration(normal, heading, size)
-    assert math.hypot(x_g, y_g) == pytest.approx(size)
-    difference = math.remainder(wall_normal_heading(x_g, y_g, heading) - normal, 2 * math.pi)
-    assert difference == pytest.approx(0.0, abs=1e-9)
+def test_a_profile_says_what_locator_speed_and_stream_are_worth(bench) -> None:
+    """The driver is told the robot's hidden truth: what it reports is then what the body did."""
+    truth = RobotProfile(locator_scale=0.8, least_speed_units=20, least_interval_s=0.04)
 
-
-def test_a_collision_without_a_direction_was_head_on() -> None:
-    assert wall_normal_heading(0.0, 0.0, 1.0) == pytest.approx(1.0 + math.pi)
-    # Thrown to its right while facing right (90°): the wall is behind, the way back is 180°.
-    assert wall_normal_heading(1.0, 0.0, math.pi / 2) == pytest.approx(math.pi)
-
-
-def test_it_is_kept_awake(bench) -> None:
     async def main() -> None:
-        manners = BoltSettings(inactivity_s=9.0, sleep_notice_s=2.0)
-        async with bench(manners=manners) as b:
-            await asyncio.sleep(120.0)
-            assert not b.virtual.asleep
-            assert b.lost == []
-            assert await b.robot.battery_v() > 3.0
-
-    run(main(), virtual=True)
-
-
-def test_will_sleep_is_answered_and_did_sleep_is_a_loss(bench) -> None:
-    async def main() -> None:
-        manners = BoltSettings(inactivity_s=5.0, sleep_notice_s=2.0)
-        # A keep-alive so late that only the answer to the announcement keeps it awake.
-        async with bench(manners=manners, profile=RobotProfile(keep_alive_s=1000.0)) as b:
-            await asyncio.sleep(60.0)
-            assert not b.virtual.asleep
-            b.virtual._firmware.fall_asleep()
+        async with bench(truth=truth, profile=truth, position_cm=(-50.0, 0.0), facing_rad=0.0) as b:
+            with pytest.raises(DriveError, match=r"ask for at least 11\.8 cm/s"):
+                await b.robot.drive(0.0, 5.0)
+            with pytest.raises(DriveError, match=r"0\.03 s is impossible: ask for 0\.04 to 65 s .*`least_interval_s`"):
+                await b.robot.start_stream(0.03)
+            await b.robot.start_stream(0.04)
+            await b.robot.drive(0.0, 20.0)
+            await asyncio.sleep(2.0)
+            rolling = b.samples[-1]
+            await b.robot.stop()
             await asyncio.sleep(1.0)
-            assert b.lost == ["it fell asleep"]
-            with pytest.raises(NotConnectedError, match="SB-1234 is not connected"):
-                await b.robot.battery_v()
+            assert b.body.locator_cm[1] == pytest.approx(b.body.distance_cm / 0.8)
+            assert b.samples[-1].y_cm == pytest.approx(b.body.distance_cm, rel=1e-6)
+            assert rolling.speed_cm_s == pytest.approx(34 * 0.59, rel=1e-6)
+            assert b.lost == []
 
     run(main(), virtual=True)
 
 
-def test_a_broken_link_is_told_once_and_can_be_made_again(bench) -> None:
+@pytest.mark.parametrize("axes", [("forward", "left"), ("left", "back")])
+def test_bumps_are_read_along_the_axes_of_the_profile(bench, axes) -> None:
+    async def main() -> None:
+        truth = RobotProfile(collision_axes=axes)
+        # Facing up the arena; the wall to the right is met at a slant.
+        async with bench(truth=truth, profile=truth, position_cm=(30.0, 0.0), facing_rad=math.pi / 2) as b:
+            await b.robot.drive(math.radians(60), 40.0)
+            await asyncio.sleep(3.0)
+            # From the wall on the right, straight back is to the left: heading 270°.
+            assert b.bumps[0].normal_heading_rad == pytest.approx(1.5 * math.pi, abs=0.01)
+
+    run(main(), virtual=True)
+
+
+def test_aiming_makes_where_it_looks_its_forward(bench) -> None:
+    async def main() -> None:
+        attitudes: list[Attitude] = []
+        # Facing the arena angle 115°; a heading of 115°, clockwise, then looks along the arena's x.
+        turn_rad = math.radians(115)
+        async with bench(position_cm=(-30.0, -10.0), facing_rad=turn_rad) as b:
+            b.robot.on_attitude = attitudes.append
+            await b.robot.start_stream(0.05, attitude=True)
+            await b.robot.drive(math.radians(30), 20.0)
+            await asyncio.sleep(0.5)
+            seen = heard_by(b)
+            await b.robot.aim(turn_rad)
+            assert math.remainder(b.body.facing_rad, math.tau) == pytest.approx(0.0, abs=1e-6)
+            assert b.body.speed_cm_s == 0.0
+            assert drives_in(seen)[0][1] == 0
+            (on_s, on), (off_s, off) = [(t_s, p.data) for t_s, p in seen if (p.did, p.cid) == commands.LEDS.key]
+            assert (on, off) == (b"\x38\x00\x00\xff", b"\x38\x00\x00\x00")
+            # It turned while the light was on: yaw runs against headings.
+            lit = [attitude for attitude in attitudes if on_s < attitude.t_host_s < off_s]
+            assert math.radians(-31) < lit[0].yaw_rad < 0
+            assert min(attitude.yaw_rad for attitude in lit) == pytest.approx(-turn_rad, abs=1e-3)
+            await asyncio.sleep(0.2)
+            assert attitudes[-1] == Attitude(b.samples[-1].t_host_s, 0.0, 0.0, 0.0)
+            way_cm, y_cm = b.body.distance_cm, b.body.y_cm
+            await b.robot.drive(0.0, 20.0)
+            await asyncio.sleep(1.0)
+            await b.robot.stop()
+            await asyncio.sleep(1.0)
+            assert b.samples[-1].y_cm == pytest.approx(b.body.distance_cm - way_cm, abs=1e-3)
+            assert b.samples[-1].x_cm == pytest.approx(0.0, abs=1e-3)
+            assert b.body.y_cm == pytest.approx(y_cm, abs=1e-6)
+            await b.robot.drive(0.0, 20.0)
+            await asyncio.sleep(6.0)
+            # The wall across the arena's x is met head on.
+            assert b.bumps[-1].normal_heading_rad == pytest.approx(math.pi, abs=1e-3)
+
+    run(main(), virtual=True)
+
+
+def test_the_light_of_an_aim_goes_out_whatever_happens(bench) -> None:
+    async def main() -> None:
+        async with bench(facing_rad=0.0) as b:
+            seen = heard_by(b)
+            with pytest.raises(TimeoutError):
+                async with asyncio.timeout(0.5):
+                    await b.robot.aim(1.0)
+            assert [p.data[1:] for _, p in seen if (p.did, p.cid) == commands.LEDS.key][-1] == bytes(3)
+            b.virtual.drop_link()
+            await asyncio.sleep(0.1)
+            with pytest.raises(NotConnectedError):
+                await b.robot.aim(1.0)
+
+    run(main(), virtual=True)
+
+
+def test_an_attitude_costs_no_sample(bench) -> None:
+    async def main() -> None:
+        attitudes: list[Attitude] = []
+        async with bench(air=AirSettings(mtu=23), position_cm=(-20.0, 0.0)) as b:
+            b.robot.on_attitude = attitudes.append
+            await b.robot.start_stream(0.05)
+            await asyncio.sleep(1.0)
+            assert attitudes == []
+            await b.robot.start_stream(0.1, attitude=True)
+            await asyncio.sleep(1.0)
+            await b.robot.start_stream(0.05)
+            await asyncio.sleep(1.0)
+            # One before the two requests that follow the first, none lost or misread at either change.
+            assert len(attitudes) == pytest.approx(11, abs=1)
+            assert len(b.samples) == pytest.approx(20 + 10 + 20, abs=3)
+            assert {round(sample.light_lux) for sample in b.samples} == {20}
+            assert {a.t_host_s for a in attitudes} <= {sample.t_host_s for sample in b.samples}
+            assert b.robot.bad_frames == 0
+
+    run(main(), virtual=True)
+
+
+def test_raw_motors_roll_until_told_to_stop(bench) -> None:
     async def main() -> None:
         async with bench(position_cm=(-50.0, 0.0), facing_rad=0.0) as b:
-            await b.robot.start_stream(0.05)
-            await b.robot.drive(0.0, 10.0)
-            await asyncio.sleep(1.0)
-            b.virtual.drop_link()
-            await asyncio.sleep(0.5)
-            assert b.lost == ["it disconnected"]
-            with pytest.raises(NotConnectedError):
-                await b.robot.stop()
-            # Nobody refreshes its command any more: it stops by itself.
-            await asyncio.sleep(5.0)
+            seen = heard_by(b)
+            await b.robot.raw_motors(34, 34)
+            await asyncio.sleep(4.0)
+            # Repeated as a drive is, or it would have stopped after 2 s.
             b.body.advance(asyncio.get_running_loop().time())
-            assert b.body.speed_cm_s == 0.0
-            await b.robot.connect()
-            await b.robot.start_stream(0.05)
-            count = len(b.samples)
+            assert b.body.distance_cm == pytest.approx(4.0 * 20.0, abs=5.0)
+            powered = [p.data for _, p in seen if (p.did, p.cid) == commands.RAW_MOTORS.key]
+            assert powered == [b"\x01\x22\x01\x22"] * 5
+            del seen[:]
+            await b.robot.stop()
+            asked = [((p.did, p.cid), p.data) for _, p in seen]
+            # Off at once, then balanced, then at rest: a drive command does nothing without balance.
+            assert asked == [
+                (commands.RAW_MOTORS.key, bytes(4)),
+                (commands.STABILISATION.key, b"\x01"),
+                (commands.DRIVE.key, bytes(4)),
+            ]
             await asyncio.sleep(1.0)
-            assert len(b.samples) == pytest.approx(count + 20, abs=1)
-            await b.robot.disconnect()
-            assert len(b.lost) == 1
+            way_cm = b.body.distance_cm
+            await asyncio.sleep(5.0)
+            assert b.body.distance_cm == way_cm
+            way_cm, x_cm = b.body.distance_cm, b.body.x_cm
+            await b.robot.raw_motors(-34, -34)
+            await asyncio.sleep(3.0)
+            await b.robot.stop()
+            await asyncio.sleep(1.0)
+            # Back, all the way.
+            assert x_cm - b.body.x_cm == pytest.approx(b.body.distance_cm - way_cm, abs=1e-6)
+            assert b.body.distance_cm - way_cm == pytest.approx(3.0 * 20.0, abs=10.0)
+            del seen[:]
+            await b.robot.raw_motors(0, -120)
+            assert [p.data for _, p in seen] == [b"\x00", b"\x00\x00\x02\x78"]
+            await b.robot.drive(1.0, 10.0)
+            await b.robot.drive(2.0, 10.0)
+            assert [(p.did, p.cid) for _, p in seen[2:]] == [
+                commands.RAW_MOTORS.key,
+                commands.STABILISATION.key,
+                commands.DRIVE.key,
+                commands.DRIVE.key,
+            ]
 
     run(main(), virtual=True)
 
 
-def test_a_link_that_breaks_under_a_question_says_so(bench) -> None:
-    async def main() -> None:
-        async with bench(air=AirSettings(latency_s=0.05)) as b:
-            asking = asyncio.ensure_future(b.robot.battery_v())
-            await asyncio.sleep(0.14)
-            b.virtual.drop_link()
-            with pytest.raises(LinkLostError, match="lost the link to SB-1234"):
-                await asking
-
-    run(main(), virtual=True)
-
-
-def test_a_silent_stream_is_a_lost_link(bench) -> None:
+def test_lights_battery_and_charger(bench) -> None:
     async def main() -> None:
         async with bench() as b:
-            await b.robot.start_stream(0.05)
-            await asyncio.sleep(1.0)
-            b.virtual._firmware.stream_interval_s = 0.0
-            start_s = asyncio.get_running_loop().time()
-            b.robot.on_lost = lambda reason: b.lost.append(
-                f"{reason} {asyncio.get_running_loop().time() - start_s:.1f}"
-            )
-            await asyncio.sleep(10.0)
-            assert b.lost == ["no sample for 3 s 3.0"]
-
-    run(main(), virtual=True)
-
-
-def test_no_answer_and_refusals_are_told_apart(bench) -> None:
-    async def main() -> None:
-        async with bench(profile=RobotProfile(reply_timeout_s=2.0)) as b:
-            with pytest.raises(CommandError, match="refused `stabilisation`: bad parameter") as caught:
-                await b.robot._link.ask(Request(commands.STABILISATION, b"\x09"))
-            assert (caught.value.code, caught.value.command, caught.value.robot) == (7, "stabilisation", "SB-1234")
-            with pytest.raises(CommandError, match="wrong payload length"):
-                await b.robot._link.ask(Request(commands.DRIVE, b"\x00"))
-            b.virtual._firmware.handle = lambda packet: None
-            with pytest.raises(ReplyTimeoutError, match="`battery voltage` within 2 s"):
-                await b.robot.battery_v()
-            # The keep-alive stays unanswered too.
-            await asyncio.sleep(20.0)
-            assert len(b.lost) == 1
-            assert "did not answer `ping`" in b.lost[0]
+            seen = heard_by(b)
+            await b.robot.set_lights(front=(1, 2, 3))
+            await b.robot.set_lights(back=(4, 5, 6))
+            await b.robot.set_lights((7, 8, 9), (10, 11, 12))
+            await b.robot.set_lights()
+            assert [bytes(p.data) for _, p in seen] == [
+                bytes((0x07, 1, 2, 3)),
+                bytes((0x38, 4, 5, 6)),
+                bytes((0x3F, 7, 8, 9, 10, 11, 12)),
+            ]
+            await b.robot.set_led(0.0)
+            await b.robot.set_pixel(7, 0, (255, 0, 0))
+            assert b.body.led_level == pytest.approx(1 / 64)
+            states = []
+            for charge in (1.0, 0.2, 0.05):
+                b.body.battery_charge = charge
+                states.append(await b.robot.battery_state())
+            assert states == [BatteryState.OK, BatteryState.LOW, BatteryState.CRITICAL]
+            assert await b.robot.charger_state() is ChargerState.NOT_CHARGING
+            b.virtual._firmware._handlers[commands.CHARGER_STATE.key] = lambda _: b"\x03"
+            assert await b.robot.charger_state() is ChargerState.CHARGED
+            b.virtual._firmware._handlers[commands.CHARGER_STATE.key] = lambda _: b"\x07"
+            with pytest.raises(PayloadError, match="`charger state` carried 1 bytes"):
+                await b.robot.charger_state()
 
     run(main(), virtual=True)
 
@@ -304,64 +373,24 @@ def test_questions_are_paced_numbered_and_matched(bench) -> None:
     run(main(), virtual=True)
 
 
-def test_unknown_names_and_silent_radios_have_a_cure(bench) -> None:
+def test_real_commands_never_carry_the_number_of_notifications(bench) -> None:
     async def main() -> None:
-        async with bench(connect=False) as b:
-            backends = {"backend": b.radio.client_backend, "scanner_backend": b.radio.scanner_backend}
-            other = Bolt("SB-FFFF", profile=RobotProfile(scan_timeout_s=2.0), **backends)
-            with pytest.raises(RobotNotFoundError, match="heard only SB-1234") as caught:
-                await other.connect()
-            assert (caught.value.robot, caught.value.seen, caught.value.timeout_s) == ("SB-FFFF", ("SB-1234",), 2.0)
-            lower = Bolt("sb-1234", **backends)
-            await lower.connect()
-            await lower.disconnect()
-            await b.virtual.close()
-            with pytest.raises(RobotNotFoundError, match="heard no robot at all"):
-                await other.connect()
-            await b.radio.close()
-            with pytest.raises(BluetoothUnavailableError, match="powered off"):
-                await other.connect()
-
-    run(main(), virtual=True)
-
-
-def test_a_robot_that_vanishes_after_it_was_heard_is_unreachable(bench) -> None:
-    async def main() -> None:
-        async with bench(connect=False, profile=RobotProfile(connect_timeout_s=3.0)) as b:
-            connect = b.radio.connect
-
-            async def vanish(address: str, timeout_s: float):
-                await b.virtual._peripheral.hide()
-                return await connect(address, timeout_s)
-
-            b.radio.connect = vanish
-            with pytest.raises(RobotUnreachableError, match="was heard but does not connect") as caught:
-                await b.robot.connect()
-            assert caught.value.address == "D0:5F:B8:00:12:34"
-            b.radio.connect = connect
-            await b.virtual._peripheral.advertise()
-            await b.robot.connect()
-
-    run(main(), virtual=True)
-
-
-def test_a_refused_setup_leaves_nobody_connected(bench) -> None:
-    async def main() -> None:
-        async with bench(connect=False) as b:
-            del b.virtual._firmware._handlers[commands.RESET_YAW.key]
-            b.virtual._firmware._handlers[commands.RESET_YAW.key] = lambda _: (_ for _ in ()).throw(
-                _refused(commands.BUSY)
-            )
-            with pytest.raises(CommandError, match="`reset yaw`: busy"):
-                await b.robot.connect()
-            await asyncio.sleep(0.1)
-            assert not b.virtual.is_connected
+        async with bench() as b:
+            seen = heard_by(b)
+            await b.robot.start_stream(0.05)
+            for n in range(100):
+                await b.robot.drive(n / 10, 5.0 + n / 100)
+                await b.robot.set_led(n / 100)
+                assert await b.robot.battery_v() > 3
+            await b.robot.stop()
+            numbers = [packet.seq for _, packet in seen]
+            assert len(numbers) > 300
+            assert 0xFF not in numbers
+            assert {(q - p) % 255 for p, q in itertools.pairwise(numbers)} == {1}
+            assert min(q - p for (p, _), (q, _) in itertools.pairwise(seen)) >= 0.075 - 1e-9
+            # The stream that came meanwhile, numbered 0xFF throughout, was taken for no answer.
+            assert len(b.samples) > 300
             assert b.lost == []
-
-    def _refused(code: int) -> Exception:
-        from robot.virtual.firmware import _RefusedError
-
-        return _RefusedError(code)
 
     run(main(), virtual=True)
 
@@ -369,6 +398,7 @@ def test_a_refused_setup_leaves_nobody_connected(bench) -> None:
 def test_impossible_wishes_are_refused_before_the_radio(bench) -> None:
     async def main() -> None:
         async with bench() as b:
+            heard = heard_by(b)
             with pytest.raises(DriveError, match="out of reach: ask for 0 to 150 cm/s"):
                 await b.robot.drive(0.0, 200.0)
             with pytest.raises(DriveError):
@@ -381,35 +411,22 @@ def test_impossible_wishes_are_refused_before_the_radio(bench) -> None:
                 await b.robot.start_stream(0.0)
             with pytest.raises(DriveError, match="impossible"):
                 await b.robot.start_stream(math.inf)
+            for wrong in ((-1, 0), (0, 8), (8, 0)):
+                with pytest.raises(DriveError, match="off the matrix: ask for 0 to 7"):
+                    await b.robot.set_pixel(*wrong, (1, 2, 3))
+            with pytest.raises(DriveError, match="a light level of 256 does not exist"):
+                await b.robot.set_pixel(0, 0, (0, 256, 0))
+            with pytest.raises(DriveError, match="a light level of -1 does not exist"):
+                await b.robot.set_lights(back=(0, 0, -1))
+            with pytest.raises(DriveError, match="a motor power of 256 does not exist: ask for -255 to 255"):
+                await b.robot.raw_motors(0, 256)
+            with pytest.raises(DriveError, match="finite"):
+                await b.robot.aim(math.nan)
+            assert heard == []
             await b.robot.set_led(0.25)
             assert b.body.led_level == pytest.approx(64 / 255)
 
     run(main(), virtual=True)
-
-
-def test_a_damaged_notification_is_dropped_with_a_warning(bench, caplog) -> None:
-    async def main() -> None:
-        async with bench() as b:
-            b.virtual._firmware.notify(commands.SENSOR_DATA, bytes(6))
-            b.virtual._firmware.notify(commands.CHARGER_CHANGED, b"\x02")
-            await asyncio.sleep(0.1)
-            assert b.samples == []
-            assert "dropped a notification of SB-1234" in caplog.text
-            assert await b.robot.battery_v() > 3
-
-    run(main(), virtual=True)
-
-
-def test_profiles_hold_together() -> None:
-    profile = RobotProfile()
-    assert profile.speed_units(0.0) == 0
-    assert profile.speed_units(0.01) == 1
-    assert profile.speed_units(59.0) == 100
-    assert profile.speed_units(profile.max_speed_cm_s) == 255
-    for wrong in ({"refresh_s": 0.0}, {"collision_threshold": 300}, {"collision_dead_s": 3.0}, {"silence_s": math.nan}):
-        with pytest.raises(RequestError, match=next(iter(wrong))):
-            RobotProfile(**wrong)
-    assert RobotProfile(command_pacing_s=0.0).command_pacing_s == 0.0
 
 
 def test_the_parser_is_fresh_after_each_connection(bench) -> None:
@@ -422,117 +439,5 @@ def test_the_parser_is_fresh_after_each_connection(bench) -> None:
             assert b.robot._link.parser is not first
             assert isinstance(first, PacketParser)
             assert b.robot.bad_frames == 0
-
-    run(main(), virtual=True)
-
-
-class _DeafLink:
-    """A link that never changes: what its owner does has no effect on the next deadline."""
-
-    is_open = True
-    last_write_s = 0.0
-
-    def __init__(self) -> None:
-        self.asked = 0
-
-    async def ask(self, request: Request) -> bytes:
-        self.asked += 1
-        return b""
-
-
-def _counted(robot: Bolt, most: int) -> list[int]:
-    """Let ``robot`` read the clock ``most`` times only, so that a busy loop fails instead of hanging."""
-    loop = asyncio.get_running_loop()
-    reads = [0]
-
-    def now_s() -> float:
-        reads[0] += 1
-        if reads[0] > most:
-            raise RuntimeError(f"busy at {loop.time()} s")
-        return loop.time()
-
-    robot._now_s = now_s
-    return reads
-
-
-async def _let_run(s: float, *tenders: asyncio.Task[None]) -> None:
-    done, others = await asyncio.wait(tenders, timeout=s)
-    for tender in others:
-        tender.cancel()
-    assert [str(tender.exception()) for tender in done] == []
-
-
-def test_a_keep_alive_without_effect_does_not_stop_the_clock() -> None:
-    async def main() -> None:
-        robot = Bolt("SB-0000")
-        link = robot._link = _DeafLink()
-        _counted(robot, 20_000)
-        await _let_run(10.0, asyncio.ensure_future(robot._tend()))
-        # From 8 s on it is due in every turn, and a turn lasts at least a millisecond.
-        assert 100 < link.asked <= 2_010
-
-    run(main(), virtual=True)
-
-
-@pytest.mark.parametrize("ahead_s", [0.0, 1e-16, 4e-10, 9e-10])
-@pytest.mark.parametrize("turns", [0, 1, 2, 3])
-def test_two_deadlines_within_a_rounding_do_not_chase_each_other(ahead_s: float, turns: int) -> None:
-    """A loop may wake its sleepers a clock's resolution early. One that then sleeps for the rest is woken
-    at once when another is ready in that turn; two that do so in turn keep each other awake, and the clock still."""
-
-    async def main() -> None:
-        loop = asyncio.get_running_loop()
-        first, second = Bolt("SB-0000"), Bolt("SB-0001")
-        for robot in (first, second):
-            robot._link = _DeafLink()
-            robot._link.last_write_s = math.inf
-            # Half a refresh is 0.4 s: awake at that instant, with the deadline just ahead.
-            robot._refresh_at_s = 0.4 + ahead_s
-            robot._speed_units = 1
-            _counted(robot, 10_000)
-        one = loop.create_task(first._tend())
-        # Both are awake at 0.4 s, in turns of the loop that may differ.
-        await asyncio.sleep(0.4)
-        for _ in range(turns):
-            await asyncio.sleep(0)
-        two = loop.create_task(second._tend())
-        await _let_run(4.7, one, two)
-        assert loop.time() == pytest.approx(5.1, abs=0.01)
-        # A repeat every 0.8 s from 0.4 s on.
-        assert first._link.asked == second._link.asked == 6
-
-    run(main(), virtual=True)
-
-
-def test_the_watch_over_a_stream_does_not_chase_a_deadline_either() -> None:
-    async def main() -> None:
-        loop = asyncio.get_running_loop()
-        failed: list[float] = []
-        tasks: list[asyncio.Task[None]] = []
-        await asyncio.sleep(3.0)
-        for n in range(2):
-            robot = Bolt(f"SB-000{n}")
-            link = robot._link = _DeafLink()
-            link.fail = lambda reason: failed.append(loop.time())
-            # A rounding before the silence is too long.
-            robot._last_sample_s = 4e-10
-            _counted(robot, 10_000)
-            tasks.append(loop.create_task(robot._watch()))
-            await asyncio.sleep(0)
-        await asyncio.wait(tasks, timeout=5.0)
-        assert failed == pytest.approx([3.0, 3.0], abs=0.01)
-
-    run(main(), virtual=True)
-
-
-def test_a_profile_of_no_pauses_at_all_lets_the_clock_run(bench) -> None:
-    async def main() -> None:
-        profile = RobotProfile(command_pacing_s=0.0, keep_alive_s=1e-12, refresh_s=1e-12)
-        async with bench(profile=profile) as b:
-            pinged = drives(b)
-            await b.robot.drive(0.0, 10.0)
-            await asyncio.sleep(0.5)
-            assert 10 < len(pinged) <= 600
-            assert b.lost == []
 
     run(main(), virtual=True)
