@@ -9,15 +9,19 @@ stream that is most of the time. The methods here do the same without.
 from __future__ import annotations
 
 import asyncio
+from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 from bumble import core, hci, ll
-from bumble.controller import Controller
+from bumble.controller import Connection, Controller
 from bumble.device import Device
 from bumble.host import Host
 from bumble.link import LocalLink
 from bumble.transport.common import TransportSink, TransportSource
 from numpy.random import Generator
+
+from lab.base.errors import RequestError
 
 NOTIFICATION = 0x1B
 """ATT opcode of a notification."""
@@ -29,20 +33,88 @@ _ACL_BYTES = 251
 _COMPLETED = bytes((hci.HCI_EVENT_PACKET, hci.HCI_NUMBER_OF_COMPLETED_PACKETS_EVENT, 5, 1))
 
 
+class DelayLine:
+    """Does one thing after another, each after a delay of its own but never before the one ahead of it."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[Callable[[], None]] = deque()
+        self._last_s = 0.0
+
+    def put(self, delay_s: float, action: Callable[[], None]) -> None:
+        """Do ``action`` in ``delay_s`` from now, or right after what was put in before and is due later."""
+        loop = asyncio.get_running_loop()
+        self._last_s = max(self._last_s, loop.time() + delay_s)
+        self._waiting.append(action)
+        # One timer for each, which does whatever is next: timers of one instant fire in any order.
+        loop.call_at(self._last_s, self._next)
+
+    def cut(self) -> None:
+        """Drop what waits; nothing may be put in any more."""
+        self._waiting.clear()
+
+    def _next(self) -> None:
+        if self._waiting:
+            self._waiting.popleft()()
+
+
 class Air(LocalLink):
-    """An in-process link with delay and loss.
+    """An in-process link with delay and loss, in which a controller may be cut off from all others.
 
     Args:
-        latency_s: Delay of every data packet.
+        latency_s: Least delay of every data packet.
+        jitter_s: Most that is added to it, drawn evenly for each packet. The packets of one direction of
+            one link keep their order, as Bluetooth's do.
         lost_share: Share of the ATT notifications that are dropped.
-        rng: Source of the losses; None when none are wanted.
+        rng: Source of losses and jitter; None when neither is wanted.
     """
 
-    def __init__(self, latency_s: float, lost_share: float, rng: Generator | None) -> None:
+    def __init__(self, latency_s: float, jitter_s: float, lost_share: float, rng: Generator | None) -> None:
         super().__init__()
         self._latency_s = latency_s
-        self._lost_share = lost_share if rng is not None else 0.0
+        self._jitter_s = jitter_s
+        self._lost_share = lost_share
         self._rng = rng
+        self._losses: dict[Controller, float] = {}
+        self._silent: set[Controller] = set()
+        # By sender and receiver: the receiver's end of the link, and what is on its way to it.
+        self._lines: dict[tuple[hci.Address, hci.Address], tuple[Connection, DelayLine]] = {}
+
+    def remove_controller(self, controller: Controller) -> None:
+        """Take a controller off the air for good."""
+        super().remove_controller(controller)
+        self._losses.pop(controller, None)
+        self._silent.discard(controller)
+
+    def lose(self, controller: Controller, share: float) -> None:
+        """Drop ``share`` of the notifications that ``controller`` sends, besides what the air drops anyway.
+
+        Raises:
+            RequestError: There is no random generator to draw the losses from.
+        """
+        if share > 0 and self._rng is None:
+            raise RequestError("virtual radio: losing notifications needs a random generator; hand one in")
+        self._losses[controller] = share
+
+    def silence(self, controller: Controller) -> None:
+        """Let nothing through to or from ``controller``; its links stay, with nobody at the other end."""
+        self._silent.add(controller)
+
+    def readmit(self, controller: Controller) -> None:
+        """Let ``controller`` be heard again; its links have timed out meanwhile, at both ends."""
+        self._silent.discard(controller)
+        for other in tuple(self.controllers):
+            for connection in tuple(other.le_connections.values()):
+                if other is controller or connection.peer_address == controller.random_address:
+                    other.on_le_disconnected(connection, CONNECTION_TIMEOUT)
+
+    def _loses(self, sender: Controller, data: bytes) -> bool:
+        """Whether this packet of ``sender`` gets lost. Layout: length (2), channel (2), then the ATT opcode."""
+        share = self._lost_share
+        if self._losses:
+            share = 1.0 - (1.0 - share) * (1.0 - self._losses.get(sender, 0.0))
+        if self._rng is None or share <= 0 or len(data) <= 4 or data[4] != NOTIFICATION:
+            return False
+        return self._rng.random() < share
 
     def send_acl_data(
         self,
@@ -52,22 +124,31 @@ class Air(LocalLink):
         data: bytes,
     ) -> None:
         """Carry one L2CAP packet across."""
-        # Layout: length (2), channel (2), then the ATT opcode.
-        lossy = self._lost_share > 0 and len(data) > 4 and data[4] == NOTIFICATION
-        if lossy and self._rng is not None and self._rng.random() < self._lost_share:
+        if self._loses(sender_controller, data):
             return
         connection = sender_controller.le_connections.get(destination_address)
         if connection is None:
             return
         sender = connection.self_address
         receiver = self._peer(sender, destination_address)
-        if receiver is None:
+        if receiver is None or sender_controller in self._silent or receiver in self._silent:
             return
-        loop = asyncio.get_running_loop()
-        if self._latency_s > 0:
-            loop.call_later(self._latency_s, receiver.on_link_acl_data, sender, transport, data)
-        else:
-            loop.call_soon(receiver.on_link_acl_data, sender, transport, data)
+        if not self._latency_s and not self._jitter_s:
+            asyncio.get_running_loop().call_soon(receiver.on_link_acl_data, sender, transport, data)
+            return
+        end = receiver.le_connections[sender]
+        known, line = self._lines.get((sender, destination_address), (None, None))
+        if line is None or known is not end:
+            line = DelayLine()
+            self._lines[sender, destination_address] = end, line
+
+        def deliver() -> None:
+            # Not to a later link between the same two.
+            if receiver.le_connections.get(sender) is end:
+                receiver.on_link_acl_data(sender, transport, data)
+
+        jitter_s = self._jitter_s * self._rng.random() if self._jitter_s and self._rng is not None else 0.0
+        line.put(self._latency_s + jitter_s, deliver)
 
     def send_ll_control_pdu(
         self, sender_address: hci.Address, receiver_address: hci.Address, packet: ll.ControlPdu
@@ -79,7 +160,8 @@ class Air(LocalLink):
                 receiver.on_ll_control_pdu(sender_address, packet)
 
         peer = self._peer(sender_address, receiver_address)
-        if peer is not None:
+        sender = self._peer(receiver_address, sender_address)
+        if peer is not None and peer not in self._silent and sender not in self._silent:
             asyncio.get_running_loop().call_soon(deliver, peer)
 
     def send_advertising_pdu(self, sender_controller: Controller, packet: ll.AdvertisingPdu) -> None:
@@ -87,10 +169,13 @@ class Air(LocalLink):
 
         Of two that answer one advertisement, the advertiser takes the first; the other's link fails at once.
         """
-        if not isinstance(packet, ll.ConnectInd):
-            super().send_advertising_pdu(sender_controller, packet)
-            return
+        loop = asyncio.get_running_loop()
         others = [controller for controller in self.controllers if controller is not sender_controller]
+        others = [] if sender_controller in self._silent else [each for each in others if each not in self._silent]
+        if not isinstance(packet, ll.ConnectInd):
+            for controller in others:
+                loop.call_soon(controller.on_ll_advertising_pdu, packet)
+            return
 
         def deliver() -> None:
             taken = False
@@ -102,7 +187,7 @@ class Air(LocalLink):
             if not taken and connection is not None:
                 sender_controller.on_le_disconnected(connection, NOT_ESTABLISHED)
 
-        asyncio.get_running_loop().call_soon(deliver)
+        loop.call_soon(deliver)
 
     def _peer(self, address: hci.Address, peer_address: hci.Address) -> Controller | None:
         """Who holds the other end of the link from ``address`` to ``peer_address``.
@@ -217,6 +302,11 @@ class QuietHost(Host):
         if self.pending_response is not None and self.pending_response.done():
             self.pending_response = None
         super().on_transport_lost()
+
+    async def _send_command(self, command: Any, response_timeout: float | None = None) -> Any:
+        """Ask the controller. Bumble's own time-out, Python 3.11's ``wait_for``, can lose a cancellation."""
+        async with asyncio.timeout(response_timeout):
+            return await super()._send_command(command)
 
     def send_hci_packet(self, packet: hci.HCI_Packet) -> None:
         """Hand an HCI packet to the controller."""

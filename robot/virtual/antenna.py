@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 from abc import ABC, abstractmethod
 from collections.abc import AsyncGenerator, Callable
 from dataclasses import dataclass, field
@@ -23,6 +24,8 @@ from robot.virtual.gatt_backend import client_backend, scanner_backend
 
 ATT_DEFAULT_MTU = 23
 _CALL_TIMEOUT_S = 5.0
+# A link whose request was taken back too late is known to its host within this time.
+_LATE_S = 0.01
 _ADVERTISING_INTERVAL_MS = 200.0
 
 
@@ -32,19 +35,21 @@ class AirSettings:
 
     Attributes:
         mtu: Largest ATT packet that the central asks for; 23 is the least, and forces fragments.
-        latency_s: Delay of every packet.
+        latency_s: Least delay of every packet.
+        jitter_s: Most that is added to it, evenly drawn; packets of one link keep their order.
         lost_share: Share of the notifications that never arrive.
     """
 
     mtu: int = 185
     latency_s: float = 0.0
     lost_share: float = 0.0
+    jitter_s: float = 0.0
 
     def __post_init__(self) -> None:
         if not ATT_DEFAULT_MTU <= self.mtu <= 247:
             raise RequestError(f"virtual radio: `mtu` must be 23 to 247, got {self.mtu}")
-        if not (self.latency_s >= 0 and 0 <= self.lost_share <= 1):
-            raise RequestError("virtual radio: `latency_s` must not be negative, `lost_share` 0 to 1")
+        if not (0 <= self.latency_s < math.inf and 0 <= self.jitter_s < math.inf and 0 <= self.lost_share <= 1):
+            raise RequestError("virtual radio: `latency_s` and `jitter_s` must not be negative, `lost_share` 0 to 1")
 
 
 def device_on(host: QuietHost, name: str, address: str) -> Device:
@@ -164,16 +169,28 @@ class Antenna(ABC):
             async with self.listening(ear):
                 await heard.wait()
             central = self.central
+            connecting = asyncio.ensure_future(central.connect_le(hci.Address(address), timeout=None))
             try:
-                connection = await central.connect_le(hci.Address(address), timeout=None)
+                # Shielded: bumble does not know a link whose request it has dropped in the same turn of the loop.
+                connection = await asyncio.shield(connecting)
             except BaseException:
                 # Out of time or cancelled: nobody may find this request in the way.
-                await self._withdraw(central)
+                await self._abandon(central, connecting)
                 raise
             if central.connections.get(connection.handle) is not connection:
                 # Gone before anybody could listen for its end: somebody else was quicker.
                 raise TimeoutError
             return connection
+
+    async def _abandon(self, central: Device, connecting: asyncio.Task[Connection]) -> None:
+        """Take a connection request back, and let go of a link that has come of it meanwhile."""
+        await self._withdraw(central)
+        done, _ = await asyncio.wait((connecting,), timeout=_LATE_S)
+        connecting.cancel()
+        if done and not connecting.cancelled() and connecting.exception() is None:
+            with contextlib.suppress(core.BaseBumbleError, hci.HCI_Error, TimeoutError):
+                async with asyncio.timeout(_CALL_TIMEOUT_S):
+                    await connecting.result().disconnect()
 
     def _heard(self, advertisement: Advertisement) -> None:
         for ear in tuple(self._listening.ears):

@@ -1,7 +1,8 @@
 """The body of the virtual robot: a ball that rolls in an arena, runs into its walls and sees the light below it.
 
 It moves only when it is asked how far it has come (``advance``), in closed form between the instants at
-which something changes, so where it is does not depend on how often it is asked.
+which something changes, so where it is does not depend on how often it is asked. Where several share an
+arena, a ``Crowd`` moves them on together.
 
 Angles: ``facing_rad`` is counter-clockwise from the arena's x axis; headings are clockwise in the robot's
 own frame. With the frame's forward axis at the arena angle F, heading h is the arena angle F - h.
@@ -11,7 +12,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from enum import Enum, auto
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.random import Generator
@@ -19,7 +21,11 @@ from numpy.typing import NDArray
 from shapely.geometry import Polygon
 
 from lab.base.errors import RequestError
-from robot.virtual.walls import Walls
+from robot.virtual.physics import BodySettings, Impact
+from robot.virtual.walls import Hit, Walls
+
+if TYPE_CHECKING:
+    from robot.virtual.crowd import Crowd
 
 Floats = NDArray[np.float64]
 LightAt = Callable[[Floats, Floats], Floats]
@@ -29,64 +35,12 @@ _MAX_STEP_S = 0.1
 _SAGITTA_CM = 1e-6
 
 
-@dataclass(frozen=True, slots=True)
-class BodySettings:
-    """Physics of the virtual robot.
+class _Next(Enum):
+    """What a ball does next."""
 
-    Attributes:
-        acceleration_cm_s2: Rate at which the speed rises and falls.
-        turn_rate_rad_s: Rate at which it turns on the spot before it rolls off.
-        speed_error: Standard deviation of the relative speed error, drawn anew for each run.
-        drift_rad_per_cm: Standard deviation of the path's curvature, drawn anew for each run: the gyro
-            believes that it goes straight.
-        locator_error: Standard deviation of the odometer's relative scale error, drawn once.
-        bump_angle_rad: Standard deviation of the error in the felt direction of a wall.
-        drive_timeout_s: It stops by itself this long after the last drive command.
-        light_noise_lux: Standard deviation of one light reading.
-        footprint_cm: Radius of the disc over which the light sensor averages.
-        led_leak_lux: Light that the own LED, at full level, adds to a reading.
-        battery_full_v: Voltage at the start.
-        battery_empty_v: Voltage at which it is empty.
-        battery_rest_s: Time at rest that empties it.
-        battery_roll_s: Rolling time that empties it.
-    """
-
-    acceleration_cm_s2: float = 80.0
-    turn_rate_rad_s: float = 8.0
-    speed_error: float = 0.02
-    drift_rad_per_cm: float = 2e-4
-    locator_error: float = 0.005
-    bump_angle_rad: float = 0.03
-    drive_timeout_s: float = 2.0
-    light_noise_lux: float = 1.0
-    footprint_cm: float = 0.5
-    led_leak_lux: float = 0.0
-    battery_full_v: float = 4.1
-    battery_empty_v: float = 3.4
-    battery_rest_s: float = 36_000.0
-    battery_roll_s: float = 9_000.0
-
-    def __post_init__(self) -> None:
-        above = ("acceleration_cm_s2", "turn_rate_rad_s", "drive_timeout_s", "battery_rest_s", "battery_roll_s")
-        for field in fields(self):
-            value = float(getattr(self, field.name))
-            if not math.isfinite(value) or value < 0 or (field.name in above and value == 0):
-                least = "above 0" if field.name in above else "0 or more"
-                raise RequestError(f"virtual robot: `{field.name}` must be {least}, got {value:g}")
-
-
-@dataclass(frozen=True, slots=True)
-class Impact:
-    """The ball met a wall at ``t_s``.
-
-    ``normal_heading_rad`` is the felt heading, in the robot's frame, from the wall into the arena, in
-    [0, 2π); ``heading_rad`` the heading it rolled along; ``speed_cm_s`` its speed across the wall.
-    """
-
-    t_s: float
-    normal_heading_rad: float
-    heading_rad: float
-    speed_cm_s: float
+    REST = auto()
+    TURN = auto()
+    ROLL = auto()
 
 
 class Body:
@@ -106,6 +60,10 @@ class Body:
         distance_cm: Path rolled since the start.
         led_level: Brightness of its LED, 0 to 1.
         on_bump: Called from within ``advance`` for each ``Impact``.
+        stuck_lux: What the light sensor reads whatever it sees; None while it works.
+        battery_charge: 0 (empty) to 1, falling with time.
+        crowd: The crowd that it is a member of, which then moves it; set by the crowd.
+        beside: Unit vectors, arena frame, from each ball that it touches to it; set by the crowd.
 
     Raises:
         RequestError: ``reachable`` is empty or not convex, or ``position_cm`` is outside it.
@@ -132,26 +90,38 @@ class Body:
         self.distance_cm = 0.0
         self.led_level = 0.0
         self.on_bump: Callable[[Impact], None] | None = None
+        self.stuck_lux: float | None = None
+        self.battery_charge = 1.0
+        self.crowd: Crowd | None = None
+        self.beside: tuple[tuple[float, float], ...] = ()
+        self._held = False
         self._t_s: float | None = None
         # Frame: arena angle of heading 0 as it truly is; the gyro's drift turns it without the robot knowing.
         self._frame_rad: float = float(rng.uniform(0.0, TURN)) if facing_rad is None else facing_rad
         self._heading_rad = 0.0
         self._wanted_heading_rad = 0.0
         self._wanted_speed_cm_s = 0.0
+        self._spin_rad_s = 0.0
         self._deadline_s = math.inf
         self._gain = 1.0
         self._drift_rad_per_cm = 0.0
         self._pressed = False
-        self._locator_scale = 1.0 + self.settings.locator_error * float(rng.standard_normal())
+        self._locator_scale = (
+            1.0 + self.settings.locator_bias + self.settings.locator_error * float(rng.standard_normal())
+        )
         self._locator_x_cm = 0.0
         self._locator_y_cm = 0.0
-        self._battery = 1.0
         self._footprint_x, self._footprint_y = _footprint(self.settings.footprint_cm)
 
     @property
     def t_s(self) -> float:
         """The instant it has been advanced to; 0 before the first ``advance``."""
         return 0.0 if self._t_s is None else self._t_s
+
+    @property
+    def started(self) -> bool:
+        """Whether its clock has been set."""
+        return self._t_s is not None
 
     @property
     def facing_rad(self) -> float:
@@ -177,7 +147,7 @@ class Body:
     def battery_v(self) -> float:
         """Battery voltage, V, falling evenly with its charge."""
         settings = self.settings
-        return settings.battery_empty_v + (settings.battery_full_v - settings.battery_empty_v) * self._battery
+        return settings.battery_empty_v + (settings.battery_full_v - settings.battery_empty_v) * self.battery_charge
 
     @property
     def moving(self) -> bool:
@@ -185,9 +155,23 @@ class Body:
         return self.speed_cm_s > 0 or self._wanted_speed_cm_s > 0
 
     @property
+    def held(self) -> bool:
+        """Whether its wheels are held: told to roll or turn it does not, and neither rolls nor bumps.
+
+        Setting it stops the ball on the spot, so ``advance`` to the present first.
+        """
+        return self._held
+
+    @held.setter
+    def held(self, held: bool) -> None:
+        self._held = held
+        if held:
+            self.speed_cm_s = 0.0
+
+    @property
     def pressed(self) -> bool:
-        """Whether it stands against a wall that its heading points into."""
-        return self._pressed
+        """Whether it stands against a wall, or a ball, that its heading points into."""
+        return self._pressed or self._faces_ball()
 
     def drive(self, heading_rad: float, speed_cm_s: float) -> None:
         """Roll along ``heading_rad`` at ``speed_cm_s`` from the present instant; speed 0 brakes.
@@ -199,14 +183,22 @@ class Body:
         turned = abs(math.remainder(heading_rad - self._wanted_heading_rad, TURN)) > 1e-6
         if speed_cm_s > 0 and (turned or self._wanted_speed_cm_s == 0):
             self._gain = max(0.0, 1.0 + settings.speed_error * float(rng.standard_normal()))
-            self._drift_rad_per_cm = settings.drift_rad_per_cm * float(rng.standard_normal())
+            drift = settings.drift_rad_per_cm * float(rng.standard_normal())
+            self._drift_rad_per_cm = drift - settings.drift_bias_rad_per_cm
         self._wanted_heading_rad = heading_rad % TURN
         self._wanted_speed_cm_s = max(0.0, speed_cm_s)
+        self._spin_rad_s = 0.0
         self._deadline_s = self.t_s + settings.drive_timeout_s if speed_cm_s > 0 else math.inf
 
     def stop(self) -> None:
         """Brake, heading as before."""
         self.drive(self._wanted_heading_rad, 0.0)
+
+    def spin(self, rate_rad_s: float) -> None:
+        """Brake, then turn on the spot, clockwise positive, until driven, stopped or timed out."""
+        self.stop()
+        self._spin_rad_s = rate_rad_s
+        self._deadline_s = self.t_s + self.settings.drive_timeout_s
 
     def reset_yaw(self) -> None:
         """Make the way it faces now heading 0."""
@@ -221,6 +213,8 @@ class Body:
 
     def light_lux(self) -> float:
         """One reading of the light sensor where it stands: footprint mean, own LED and noise, lux (>= 0)."""
+        if self.stuck_lux is not None:
+            return self.stuck_lux
         light = self._light_at(self._footprint_x + self.x_cm, self._footprint_y + self.y_cm)
         mean = float(light.sum()) / light.size
         settings = self.settings
@@ -228,42 +222,103 @@ class Body:
         return max(0.0, mean + settings.led_leak_lux * self.led_level + noise)
 
     def advance(self, t_s: float) -> None:
-        """Move on to the instant ``t_s``; an instant already passed changes nothing.
+        """Move on to the instant ``t_s``, with its crowd if it has one; an instant already passed changes nothing.
 
         The first call sets the clock.
         """
+        if self.crowd is not None:
+            self.crowd.advance(t_s)
+        else:
+            self.advance_alone(t_s)
+
+    def advance_alone(self, t_s: float) -> None:
+        """``advance`` with no eye for other balls: what a crowd moves its members by."""
         if self._t_s is None:
             self._t_s = t_s
             return
         while self._t_s < t_s:
             if self._t_s >= self._deadline_s:
                 self._wanted_speed_cm_s = 0.0
+                self._spin_rad_s = 0.0
                 self._deadline_s = math.inf
             self._step(self._t_s, min(t_s, self._deadline_s) - self._t_s)
 
+    def touch(self, normal_rad: float, closing_cm_s: float | None = None) -> None:
+        """Run into something here that is no wall: feel an impact, and stop unless it moves away from it.
+
+        Args:
+            normal_rad: Arena angle from the thing to the ball.
+            closing_cm_s: Speed at which they met; its own across the normal when not given.
+        """
+        facing_rad = self.facing_rad
+        into_cm_s = -self.speed_cm_s * math.cos(normal_rad - facing_rad)
+        if into_cm_s > 0:
+            self.speed_cm_s = 0.0
+        self._bump(normal_rad, max(0.0, into_cm_s) if closing_cm_s is None else closing_cm_s)
+
+    def outlook(self, dt_s: float) -> tuple[float, float, float]:
+        """How it moves next, for whoever must not miss its meeting with something that moves too.
+
+        Args:
+            dt_s: Longest time of interest.
+
+        Returns:
+            The time, at most ``dt_s``, for which its speed is sure to change evenly; the rate at which it
+            then does, cm/s²; and the most that its path may bend away meanwhile, cm/s².
+        """
+        if self.t_s >= self._deadline_s:
+            return 0.0, 0.0, 0.0
+        next_up, step_s, acceleration, end_cm_s = self._plan(min(dt_s, self._deadline_s - self.t_s))
+        if next_up is not _Next.ROLL:
+            return step_s, 0.0, 0.0
+        while True:
+            way_cm, _, hit = self._path(step_s, end_cm_s)
+            if hit is None or not self._bends(way_cm):
+                break
+            step_s /= 2.0
+            end_cm_s = self.speed_cm_s + acceleration * step_s
+        if hit is not None:
+            step_s = min(step_s, self._time_to(hit.distance_cm, acceleration)[0])
+        bend = abs(self._drift_rad_per_cm) * max(self.speed_cm_s, end_cm_s) ** 2
+        return step_s, acceleration, bend
+
     def _step(self, t_s: float, dt_s: float) -> None:
         """Live through at most ``dt_s`` in which the acceleration does not change."""
-        settings = self.settings
-        rolls = self.speed_cm_s > 0
-        astray = abs(math.remainder(self._wanted_heading_rad - self._heading_rad, TURN))
-        aim_cm_s = self._wanted_speed_cm_s * self._gain
-        if astray > 1e-9 and aim_cm_s > 0:
-            if not rolls:
-                self._turn(t_s, dt_s)
-                return
-            aim_cm_s = 0.0
-        if not rolls and (aim_cm_s == 0 or self._faces_wall()):
-            self._battery = max(0.0, self._battery - dt_s / settings.battery_rest_s)
+        next_up, step_s, acceleration, end_cm_s = self._plan(dt_s)
+        if next_up is _Next.ROLL:
+            self._roll(t_s, step_s, acceleration, end_cm_s)
+        elif next_up is _Next.TURN:
+            self._turn(t_s, dt_s)
+        else:
+            if self._spin_rad_s and not self._held:
+                self._heading_rad = (self._heading_rad + self._spin_rad_s * dt_s) % TURN
+                self._wanted_heading_rad = self._heading_rad
+                self._pressed = False
+            self.battery_charge = max(0.0, self.battery_charge - dt_s / self.settings.battery_rest_s)
             self._t_s = t_s + dt_s
-            return
+
+    def _plan(self, dt_s: float) -> tuple[_Next, float, float, float]:
+        """What comes next, for at most ``dt_s``: what it does, for how long, acceleration and end speed."""
+        if self._held:
+            return _Next.REST, dt_s, 0.0, 0.0
+        settings = self.settings
         speed = self.speed_cm_s
+        aim_cm_s = self._wanted_speed_cm_s * self._gain
+        astray = abs(math.remainder(self._wanted_heading_rad - self._heading_rad, TURN))
+        # Told to roll or not, it faces the heading that it was given last; a spin gives it none.
+        if astray > 1e-9 and not self._spin_rad_s:
+            if speed <= 0:
+                return _Next.TURN, min(dt_s, astray / settings.turn_rate_rad_s), 0.0, 0.0
+            aim_cm_s = 0.0
+        if speed <= 0 and (aim_cm_s == 0 or self._faces_wall() or self._faces_ball()):
+            return _Next.REST, dt_s, 0.0, 0.0
         acceleration = 0.0
         until_s = math.inf
         if speed != aim_cm_s:
             acceleration = math.copysign(settings.acceleration_cm_s2, aim_cm_s - speed)
             until_s = (aim_cm_s - speed) / acceleration
         step_s = min(dt_s, _MAX_STEP_S, until_s)
-        self._roll(t_s, step_s, acceleration, aim_cm_s if step_s == until_s else speed + acceleration * step_s)
+        return _Next.ROLL, step_s, acceleration, aim_cm_s if step_s == until_s else speed + acceleration * step_s
 
     def _turn(self, t_s: float, dt_s: float) -> None:
         """Turn on the spot towards the wanted heading, the short way."""
@@ -276,7 +331,7 @@ class Body:
                 self._heading_rad + math.copysign(self.settings.turn_rate_rad_s * turned_s, left)
             ) % TURN
         self._pressed = False
-        self._battery = max(0.0, self._battery - turned_s / self.settings.battery_rest_s)
+        self.battery_charge = max(0.0, self.battery_charge - turned_s / self.settings.battery_rest_s)
         # A turn that ends within one rounding of t_s must still end.
         self._t_s = max(t_s + turned_s, math.nextafter(t_s, math.inf))
 
@@ -287,25 +342,44 @@ class Body:
             self._pressed = self._walls.blocks(self.x_cm, self.y_cm, math.cos(facing), math.sin(facing))
         return self._pressed
 
+    def _faces_ball(self) -> bool:
+        """Whether it touches a ball that it faces."""
+        if not self.beside:
+            return False
+        facing_rad = self.facing_rad
+        along_x, along_y = math.cos(facing_rad), math.sin(facing_rad)
+        return any(x * along_x + y * along_y < 0 for x, y in self.beside)
+
+    def _path(self, step_s: float, end_speed_cm_s: float) -> tuple[float, float, Hit | None]:
+        """The chord that it rolls in ``step_s``: length, arena angle, and the wall on it."""
+        way_cm = max(0.0, (self.speed_cm_s + end_speed_cm_s) / 2.0 * step_s)
+        angle = self._frame_rad - self._heading_rad + self._drift_rad_per_cm * way_cm / 2.0
+        return way_cm, angle, self._walls.hit(self.x_cm, self.y_cm, math.cos(angle), math.sin(angle), way_cm)
+
+    def _bends(self, way_cm: float) -> bool:
+        """Whether the chord leaves the arc by too much to meet a wall on."""
+        return abs(self._drift_rad_per_cm) * way_cm * way_cm > 8.0 * _SAGITTA_CM
+
+    def _time_to(self, way_cm: float, acceleration: float) -> tuple[float, float]:
+        """Time to roll ``way_cm`` and the speed then: root of v t + a t²/2 = d, in the form that does not cancel."""
+        end_cm_s = math.sqrt(max(0.0, self.speed_cm_s * self.speed_cm_s + 2.0 * acceleration * way_cm))
+        both = self.speed_cm_s + end_cm_s
+        return (2.0 * way_cm / both if both > 0 else math.inf), end_cm_s
+
     def _roll(self, t_s: float, step_s: float, acceleration: float, end_speed_cm_s: float) -> None:
         """Roll for ``step_s``, or until the wall."""
-        speed = self.speed_cm_s
-        way_cm = max(0.0, (speed + end_speed_cm_s) / 2.0 * step_s)
-        angle = self._frame_rad - self._heading_rad + self._drift_rad_per_cm * way_cm / 2.0
-        along_x, along_y = math.cos(angle), math.sin(angle)
-        hit = self._walls.hit(self.x_cm, self.y_cm, along_x, along_y, way_cm)
+        way_cm, angle, hit = self._path(step_s, end_speed_cm_s)
         impact_cm_s = 0.0
-        if hit is not None and abs(self._drift_rad_per_cm) * way_cm * way_cm > 8.0 * _SAGITTA_CM:
+        if hit is not None and self._bends(way_cm):
             # Near a wall the chord must not leave the arc: come closer first.
-            self._roll(t_s, step_s / 2.0, acceleration, speed + acceleration * step_s / 2.0)
+            self._roll(t_s, step_s / 2.0, acceleration, self.speed_cm_s + acceleration * step_s / 2.0)
             return
         if hit is not None:
             way_cm = hit.distance_cm
-            # Time to roll the way: root of v t + a t²/2 = d, in the form that does not cancel.
-            impact_cm_s = math.sqrt(max(0.0, speed * speed + 2.0 * acceleration * way_cm))
-            both = speed + impact_cm_s
-            step_s = min(step_s, 2.0 * way_cm / both) if both > 0 else step_s
+            until_s, impact_cm_s = self._time_to(way_cm, acceleration)
+            step_s = min(step_s, until_s)
             end_speed_cm_s = 0.0
+        along_x, along_y = math.cos(angle), math.sin(angle)
         self.x_cm += way_cm * along_x
         self.y_cm += way_cm * along_y
         self.distance_cm += way_cm
@@ -314,7 +388,7 @@ class Body:
         felt_cm = way_cm * self._locator_scale
         self._locator_x_cm += felt_cm * math.sin(self._heading_rad)
         self._locator_y_cm += felt_cm * math.cos(self._heading_rad)
-        self._battery = max(0.0, self._battery - step_s / self.settings.battery_roll_s)
+        self.battery_charge = max(0.0, self.battery_charge - step_s / self.settings.battery_roll_s)
         self._t_s = max(t_s + step_s, math.nextafter(t_s, math.inf))
         if hit is not None:
             self._pressed = True

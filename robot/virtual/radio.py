@@ -65,6 +65,7 @@ class Peripheral:
         on_connect: Called when a central has connected.
         on_disconnect: Called when it has gone.
         on_write: Called with the characteristic's uuid and the bytes written to it.
+        on_read: Called with the characteristic's uuid, returns what it reads as; nothing while there is none.
     """
 
     def __init__(self, radio: VirtualRadio, name: str, address: str, services: tuple[GattService, ...]) -> None:
@@ -73,6 +74,7 @@ class Peripheral:
         self.on_connect: Callable[[], None] | None = None
         self.on_disconnect: Callable[[], None] | None = None
         self.on_write: Callable[[str, bytes], None] | None = None
+        self.on_read: Callable[[str], bytes] | None = None
         self._radio = radio
         self._device = radio.make_device(name, address)
         self._connection: Connection | None = None
@@ -101,7 +103,10 @@ class Peripheral:
             if self.on_write is not None:
                 self.on_write(described.uuid, bytes(value))
 
-        value = CharacteristicValue[bytes](read=lambda _: b"", write=written)
+        def read(_: Connection) -> bytes:
+            return self.on_read(described.uuid) if self.on_read is not None else b""
+
+        value = CharacteristicValue[bytes](read=read, write=written)
         made = Characteristic[bytes](described.uuid, allowed, permissions, value)
         self._characteristics[described.uuid] = made
         return made
@@ -176,6 +181,22 @@ class Peripheral:
         if self._connection is not None:
             self.controller.break_links(reason)
 
+    def fall_silent(self) -> None:
+        """Neither hear nor be heard, until ``come_back``; nobody is told, and no link ends."""
+        self._radio.air.silence(self.controller)
+
+    def come_back(self) -> None:
+        """Be heard again. A link of the time before has timed out: both ends are told so."""
+        self._radio.air.readmit(self.controller)
+
+    def lose(self, share: float) -> None:
+        """Lose ``share`` of the notifications from now on, besides what the air loses anyway.
+
+        Raises:
+            RequestError: The radio has no random generator to draw them from.
+        """
+        self._radio.air.lose(self.controller, share)
+
     def _connected(self, connection: Connection) -> None:
         self._connection = connection
         connection.on(Connection.EVENT_DISCONNECTION, self._disconnected)
@@ -196,16 +217,17 @@ class VirtualRadio(Antenna):
 
     Args:
         settings: What the air does.
-        rng: Source of the losses; needed when ``lost_share`` is not 0.
+        rng: Source of losses and jitter; needed when ``lost_share`` or ``jitter_s`` is not 0, and by a
+            robot that is told to ``lose`` notifications.
 
     Raises:
-        RequestError: ``lost_share`` is given without ``rng``.
+        RequestError: ``lost_share`` or ``jitter_s`` is given without ``rng``.
     """
 
     def __init__(self, settings: AirSettings | None = None, *, rng: Generator | None = None) -> None:
         super().__init__(settings)
-        if self.settings.lost_share and rng is None:
-            raise RequestError("virtual radio: losing notifications needs a random generator; hand one in")
+        if (self.settings.lost_share or self.settings.jitter_s) and rng is None:
+            raise RequestError("virtual radio: losing notifications and jitter need a random generator; hand one in")
         self._rng = rng
         self._air: Air | None = None
         self._peripherals: list[Peripheral] = []
@@ -217,7 +239,7 @@ class VirtualRadio(Antenna):
         if self._central is not None:
             return
         settings = self.settings
-        self._air = Air(settings.latency_s, settings.lost_share, self._rng)
+        self._air = Air(settings.latency_s, settings.jitter_s, settings.lost_share, self._rng)
         await self._switch_on(self.make_device("host", _CENTRAL_ADDRESS))
 
     async def close(self) -> None:
@@ -228,15 +250,29 @@ class VirtualRadio(Antenna):
         self._controllers.clear()
         self._air = None
 
+    @property
+    def can_lose(self) -> bool:
+        """Whether there is a random generator to draw losses from."""
+        return self._rng is not None
+
+    @property
+    def air(self) -> Air:
+        """The air itself.
+
+        Raises:
+            RadioError: The radio is not started.
+        """
+        if self._air is None:
+            raise RadioError(self._off)
+        return self._air
+
     def make_device(self, name: str, address: str) -> Device:
         """A bumble device with a controller of its own in this air.
 
         Raises:
             RadioError: The radio is not started.
         """
-        if self._air is None:
-            raise RadioError("the virtual radio is off: start it first")
-        controller = QuietController(name, self._air)
+        controller = QuietController(name, self.air)
         host = QuietHost(controller)
         controller.host = host
         device = device_on(host, name, address)
@@ -249,12 +285,11 @@ class VirtualRadio(Antenna):
         Raises:
             RadioError: The radio is not started.
         """
-        if self._air is None:
-            raise RadioError("the virtual radio is off: start it first")
+        air = self.air
         number = next(self._guests) % 0x10000
         # Public addresses of their own, for hosts that do not set a random one.
         address = f"00:5F:B8:01:{number >> 8:02X}:{number & 0xFF:02X}"
-        return QuietController(f"guest {number}", self._air, public_address=address)
+        return QuietController(f"guest {number}", air, public_address=address)
 
     def dismiss(self, controller: QuietController) -> None:
         """Take the controller of a host that is gone off the air; its peers find that they hear nothing."""

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -192,8 +193,6 @@ def test_mean_run_length_in_lambert_rolling_is_cauchys() -> None:
 
 def test_light_is_averaged_over_the_footprint(ideal) -> None:
     """The mean of a quadratic over a disc is known: of x² it is x0² + R²/4."""
-    from dataclasses import replace
-
     physics = replace(ideal, footprint_cm=2.0, led_leak_lux=8.0)
     body = make(physics=physics, light_at=lambda x, y: 100 + 3 * x - y + x * x, position_cm=(5.0, -4.0))
     assert body.light_lux() == pytest.approx(100 + 15 + 4 + 25 + 1.0, abs=0.02)
@@ -260,3 +259,93 @@ def test_bad_settings_and_starts_are_refused() -> None:
         BodySettings(light_noise_lux=-1.0)
     with pytest.raises(RequestError, match="outside the arena"):
         make(position_cm=(100.0, 0.0))
+
+
+def test_a_biased_drift_bends_every_run_clockwise(ideal) -> None:
+    physics = replace(ideal, drift_bias_rad_per_cm=4e-3, drive_timeout_s=60.0)
+    body = make(physics=physics, position_cm=(0.0, 0.0), facing_rad=0.0)
+    body.drive(0.0, 40.0)
+    body.advance(1.2)
+    # An arc of the circle about (0, -1/curvature).
+    turned = 4e-3 * body.distance_cm
+    assert body.facing_rad == pytest.approx(-turned % math.tau)
+    assert (body.x_cm, body.y_cm) == pytest.approx((250 * math.sin(turned), -250 * (1 - math.cos(turned))), abs=1e-3)
+    assert body.heading_rad == 0.0
+
+
+def test_a_biased_odometer_reports_its_share_of_the_way(ideal) -> None:
+    body = make(physics=replace(ideal, locator_bias=-0.04), position_cm=(0.0, 0.0), facing_rad=0.0)
+    roll(body, 0.0, 30.0, 1.0)
+    assert body.locator_cm[1] == pytest.approx(0.96 * body.distance_cm)
+    assert body.locator_speed_cm_s == pytest.approx(0.96 * 30.0)
+
+
+def test_held_wheels_neither_roll_nor_turn_nor_bump(ideal) -> None:
+    body = make(physics=ideal, position_cm=(50.0, 0.0), facing_rad=0.0)
+    hits: list[Impact] = []
+    body.on_bump = hits.append
+    roll(body, 0.0, 20.0, 0.2)
+    body.held = True
+    stood = (body.x_cm, body.y_cm, body.locator_cm, body.distance_cm, body.facing_rad)
+    roll(body, 1.0, 40.0, 2.0)
+    assert (body.x_cm, body.y_cm, body.locator_cm, body.distance_cm, body.facing_rad) == stood
+    assert (body.speed_cm_s, body.locator_speed_cm_s, hits, body.moving) == (0.0, 0.0, [], True)
+    body.held = False
+    roll(body, 0.0, 40.0, 1.0)
+    assert (body.x_cm, len(hits)) == (pytest.approx(56.35), 1)
+
+
+def test_a_stuck_sensor_reads_the_same_whatever_it_sees(ideal) -> None:
+    body = make(physics=ideal, light_at=lambda x, y: 100 + x, position_cm=(0.0, 0.0))
+    body.stuck_lux = 33.0
+    assert body.light_lux() == 33.0
+    body.x_cm = 20.0
+    assert body.light_lux() == 33.0
+    body.stuck_lux = None
+    assert body.light_lux() == pytest.approx(120.0, abs=0.1)
+
+
+def test_the_battery_can_be_drained(ideal) -> None:
+    body = make(physics=ideal)
+    body.battery_charge = 0.1
+    assert body.battery_v == pytest.approx(3.4 + 0.07)
+    body.advance(3600.0)
+    assert body.battery_charge == 0.0
+
+
+def test_what_it_touches_stops_it_unless_it_moves_away(ideal) -> None:
+    body = make(physics=ideal, position_cm=(0.0, 0.0), facing_rad=0.5)
+    hits: list[Impact] = []
+    body.on_bump = hits.append
+    roll(body, 0.0, 20.0, 1.0)
+    body.touch(0.5)
+    assert (body.speed_cm_s, hits[0].speed_cm_s) == (pytest.approx(20.0), 0.0)
+    body.touch(0.5 + math.pi - 1.0)
+    assert body.speed_cm_s == 0.0
+    assert hits[1].speed_cm_s == pytest.approx(20.0 * math.cos(1.0))
+    # The normal points back, 1 rad to the right of straight back as headings go clockwise.
+    assert hits[1].normal_heading_rad == pytest.approx(math.pi + 1.0)
+    body.touch(0.5, 7.0)
+    assert hits[2].speed_cm_s == 7.0
+
+
+def test_it_spins_on_the_spot_until_the_time_out(ideal) -> None:
+    body = make(physics=ideal, position_cm=(0.0, 0.0), facing_rad=0.0)
+    roll(body, 0.0, 20.0, 1.0)
+    body.spin(0.5)
+    body.advance(2.0)
+    x_cm = body.x_cm
+    turned = 0.5 * (1.0 - 20.0 / 80.0)  # once it has braked
+    assert body.heading_rad == pytest.approx(turned)
+    assert body.facing_rad == pytest.approx(-turned % math.tau)
+    body.advance(60.0)
+    assert body.heading_rad == pytest.approx(0.5 * (2.0 - 20.0 / 80.0))
+    assert body.x_cm == x_cm
+
+
+def test_biases_may_be_negative_but_not_absurd() -> None:
+    BodySettings(drift_bias_rad_per_cm=-0.01, locator_bias=-0.1)
+    with pytest.raises(RequestError, match="drift_bias_rad_per_cm"):
+        BodySettings(drift_bias_rad_per_cm=math.inf)
+    with pytest.raises(RequestError, match="locator_bias"):
+        BodySettings(locator_bias=-1.0)

@@ -8,10 +8,8 @@ import json
 import math
 import socket
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pytest
 from bleak import BleakScanner
 from bleak.exc import BleakError
@@ -19,25 +17,21 @@ from bumble import core, hci
 from bumble.device import Device, Peer
 from bumble.gatt import GATT_GENERIC_ACCESS_SERVICE
 from bumble.transport import open_transport
-from shapely.geometry import box
 
 from lab.base.errors import RequestError
 from lab.clock import run
-from robot.bolt import Bolt, scan
+from robot.bolt import scan
 from robot.device import Sample
 from robot.errors import RadioError, RobotNotFoundError, RobotUnreachableError
 from robot.profile import RobotProfile
 from robot.virtual import hci_server
-from robot.virtual.body import Body, BodySettings
-from robot.virtual.bolt import VirtualBolt
+from robot.virtual.faults import Fault, schedule
 from robot.virtual.hci_client import HciRadio
 from robot.virtual.hci_server import HciServer, format_endpoint, parse_endpoint
 from robot.virtual.radio import VirtualRadio
+from tests.robot.hci_bench import ADDRESS, NAME, antenna, bolt_on, served, until
 
 ROOT = Path(__file__).resolve().parents[2]
-NAME, ADDRESS = "SB-C0DE", "D0:5F:B8:00:C0:DE"
-# Answers come by loopback: no need to be polite to a real radio.
-BRISK = RobotProfile(command_pacing_s=0.0)
 PATIENCE_S = 30.0
 
 CLIENT = """
@@ -55,7 +49,7 @@ async def main(endpoint, name, mode):
     robot.on_sample, robot.on_lost = samples.append, lost.append
     await robot.connect()
     identity = await robot.identity()
-    await robot.start_stream(0.02)
+    await robot.start_stream(0.03)
     await robot.drive(0.0, 20.0)
     if mode == "roll for ever":
         print("rolling", flush=True)
@@ -74,62 +68,32 @@ async def main(endpoint, name, mode):
 
 asyncio.run(asyncio.wait_for(main(*sys.argv[1:]), 60.0))
 """
+# Nothing of ours, as bumble's own examples are.
+SCANNER = """
+import asyncio, sys
+from bumble.core import AdvertisingData
+from bumble.device import Device
+from bumble.hci import Address
+from bumble.transport import open_transport
 
+async def main(endpoint):
+    async with await open_transport(f"tcp-client:{endpoint}") as (source, sink):
+        device = Device.with_hci("scanner", Address("F0:F1:F2:F3:F4:F6"), source, sink)
+        await device.power_on()
+        heard = asyncio.Queue()
+        device.on("advertisement", heard.put_nowait)
+        await device.start_scanning()
+        one = await heard.get()
+        print(one.data.get(AdvertisingData.Type.COMPLETE_LOCAL_NAME), one.address.to_string(False))
 
-@dataclass
-class Served:
-    server: HciServer
-    virtual: VirtualBolt
-    body: Body
-
-
-@contextlib.asynccontextmanager
-async def served(*, robots: int = 1):
-    """A robot at the arena's centre that faces +x; bright on the right of x = 10 cm, dark on the left."""
-    radio = VirtualRadio()
-    await radio.start()
-    still = BodySettings(speed_error=0.0, drift_rad_per_cm=0.0, locator_error=0.0, light_noise_lux=0.0)
-    twins: list[VirtualBolt] = []
-    for n in range(robots):
-        body = Body(
-            box(-56.35, -41.35, 56.35, 41.35),
-            lambda x, y: np.where(x > 10.0, 120.0, 20.0),
-            np.random.default_rng(5),
-            still,
-            position_cm=(0.0, 0.0),
-            facing_rad=0.0,
-        )
-        twin = VirtualBolt(radio, body, NAME if n == 0 else f"SB-{n:04X}")
-        await twin.start()
-        twins.append(twin)
-    server = HciServer(radio, "127.0.0.1", 0)
-    try:
-        async with asyncio.timeout(60.0):
-            await server.start()
-            yield Served(server, twins[0], twins[0].body)
-    finally:
-        await server.close()
-        await radio.close()
+asyncio.run(asyncio.wait_for(main(*sys.argv[1:]), 30.0))
+"""
 
 
 @contextlib.asynccontextmanager
-async def antenna(endpoint: str):
-    radio = HciRadio(endpoint)
-    await radio.start()
-    try:
-        yield radio
-    finally:
-        await radio.close()
-
-
-def bolt_on(radio: HciRadio, name: str = NAME, profile: RobotProfile = BRISK) -> Bolt:
-    return Bolt(name, backend=radio.client_backend, scanner_backend=radio.scanner_backend, profile=profile)
-
-
-@contextlib.asynccontextmanager
-async def other_process(endpoint: str, mode: str):
+async def other_process(code: str, *arguments: str):
     child = await asyncio.create_subprocess_exec(
-        sys.executable, "-c", CLIENT, endpoint, NAME, mode, cwd=ROOT, stdout=asyncio.subprocess.PIPE
+        sys.executable, "-c", code, *arguments, cwd=ROOT, stdout=asyncio.subprocess.PIPE
     )
     try:
         yield child
@@ -140,15 +104,9 @@ async def other_process(endpoint: str, mode: str):
             await child.communicate()
 
 
-async def until(condition, timeout_s: float = 10.0) -> None:
-    async with asyncio.timeout(timeout_s):
-        while not condition():  # noqa: ASYNC110
-            await asyncio.sleep(0.01)
-
-
 def test_another_process_finds_connects_drives_and_streams() -> None:
     async def main() -> None:
-        async with served() as s, other_process(s.server.endpoint, "a little") as child:
+        async with served() as s, other_process(CLIENT, s.server.endpoint, NAME, "a little") as child:
             async with asyncio.timeout(PATIENCE_S):
                 out, _ = await child.communicate()
             assert child.returncode == 0
@@ -170,9 +128,51 @@ def test_another_process_finds_connects_drives_and_streams() -> None:
     run(main(), virtual=False)
 
 
+def test_a_bumble_client_in_another_process_finds_it_by_its_name() -> None:
+    async def main() -> None:
+        async with served() as s, other_process(SCANNER, s.server.endpoint) as child:
+            async with asyncio.timeout(PATIENCE_S):
+                out, _ = await child.communicate()
+            assert out.decode().split() == [NAME, ADDRESS]
+
+    run(main(), virtual=False)
+
+
+def test_the_robots_faults_reach_clients_of_the_server() -> None:
+    async def main() -> None:
+        async with served() as s, antenna(s.server.endpoint) as radio:
+            samples: list[Sample] = []
+            lost: list[str] = []
+            robot = bolt_on(radio)
+            robot.on_sample, robot.on_lost = samples.append, lost.append
+            await robot.connect()
+            await robot.start_stream(0.025)
+            await until(lambda: bool(samples))
+            s.virtual.lose(1.0, 0.5)
+            await asyncio.sleep(0.1)
+            before = len(samples)
+            await asyncio.sleep(0.3)
+            assert len(samples) == before
+            await until(lambda: len(samples) > before)
+            schedule([Fault("vanish", asyncio.get_running_loop().time() - s.virtual.started_s, 1.0)], s.virtual)
+            await asyncio.sleep(0.5)
+            before = len(samples)
+            assert await scan(0.4, radio.scanner_backend) == []
+            assert (lost, len(samples)) == ([], before)
+            await until(lambda: bool(lost))
+            await robot.connect()
+            s.virtual.drop_link(0.5)
+            await until(lambda: len(lost) == 2)
+            assert await scan(0.2, radio.scanner_backend) == []
+            await robot.connect()
+            await robot.disconnect()
+
+    run(main(), virtual=False)
+
+
 def test_a_client_killed_while_it_drives_frees_the_robot_which_stops() -> None:
     async def main() -> None:
-        async with served() as s, other_process(s.server.endpoint, "roll for ever") as child:
+        async with served() as s, other_process(CLIENT, s.server.endpoint, NAME, "roll for ever") as child:
             assert child.stdout is not None
             async with asyncio.timeout(PATIENCE_S):
                 assert await child.stdout.readline() == b"rolling\n"
@@ -206,7 +206,7 @@ def test_clients_take_turns_and_a_second_one_waits() -> None:
             await second.connect()
             samples: list[Sample] = []
             second.on_sample = samples.append
-            await second.start_stream(0.01)
+            await second.start_stream(0.025)
             await until(lambda: len(samples) >= 20)
             await second.drive(math.pi / 2, 15.0)
             await until(lambda: samples[-1].x_cm > 1.0)
@@ -293,7 +293,7 @@ def test_of_two_that_answer_one_advertisement_one_gets_the_robot() -> None:
         async with served() as s, stranger(s.server.endpoint) as one, stranger(s.server.endpoint) as two:
             await s.virtual._peripheral.hide()
             asked = [asyncio.ensure_future(each.connect(hci.Address(ADDRESS), timeout=5.0)) for each in (one, two)]
-            await until(lambda: sum(c.pending_le_connection is not None for c in s.server.radio._air.controllers) == 2)
+            await until(lambda: sum(c.pending_le_connection is not None for c in s.server.radio.air.controllers) == 2)
             await s.virtual._peripheral.advertise()
             await asyncio.gather(*asked)
             await until(lambda: len(one.connections) + len(two.connections) == 1)
@@ -334,7 +334,7 @@ def test_a_request_out_of_time_is_taken_back() -> None:
             with pytest.raises(RobotUnreachableError):
                 await robot.connect()
             radio.central.connect_le = connect
-            assert not any(c.pending_le_connection for c in s.server.radio._air.controllers)
+            assert not any(c.pending_le_connection for c in s.server.radio.air.controllers)
             await s.virtual._peripheral.advertise()
             await robot.connect()
             await robot.disconnect()

@@ -206,6 +206,121 @@ def test_latency_and_loss_are_as_asked() -> None:
     run(main(), virtual=True)
 
 
+@pytest.mark.parametrize("latency_s", [0.0, 0.03])
+def test_jitter_spreads_packets_evenly_and_keeps_their_order(latency_s: float) -> None:
+    async def main() -> None:
+        async with air(AirSettings(latency_s=latency_s, jitter_s=0.04)) as (radio, one):
+            loop = asyncio.get_running_loop()
+            sent: list[float] = []
+            arrived: list[tuple[float, int]] = []
+            async with client_of(radio, one) as client:
+                await client.start_notify(
+                    TALK, lambda _, value: arrived.append((loop.time(), int.from_bytes(value, "big")))
+                )
+                # Slower than the jitter, no packet waits for another; faster, many do.
+                for every_s, count in ((0.05, 2000), (0.005, 2000)):
+                    sent.clear()
+                    arrived.clear()
+                    for n in range(count):
+                        sent.append(loop.time())
+                        one.notify(TALK, n.to_bytes(2, "big"))
+                        await asyncio.sleep(every_s)
+                    await asyncio.sleep(0.1)
+                    assert [n for _, n in arrived] == list(range(count))
+                    delays = np.array([t_s for t_s, _ in arrived]) - sent - latency_s
+                    assert delays.min() >= -1e-9
+                    assert delays.max() <= 0.04 + 1e-9
+                    if every_s > 0.04:
+                        # Kolmogorov's bound at 0.1 % for an even spread.
+                        even = np.arange(1, count + 1) / count
+                        assert np.abs(np.sort(delays) / 0.04 - even).max() < 1.95 / np.sqrt(count)
+                    else:
+                        # The latest of the packets before is what counts: late more often than even.
+                        assert delays.mean() > 0.025
+                # A hundred at once come in order too, in both directions.
+                arrived.clear()
+                written: list[bytes] = []
+                one.on_write = lambda _, value: written.append(value)
+                for n in range(100):
+                    one.notify(TALK, n.to_bytes(2, "big"))
+                    await client.write_gatt_char(TALK, bytes([n]), response=False)
+                await asyncio.sleep(0.5)
+                assert [n for _, n in arrived] == list(range(100))
+                assert written == [bytes([n]) for n in range(100)]
+
+    run(main(), virtual=True)
+
+
+def test_what_was_on_its_way_does_not_reach_the_next_link() -> None:
+    async def main() -> None:
+        async with air(AirSettings(latency_s=0.001)) as (radio, one):
+            written: list[bytes] = []
+            one.on_write = lambda _, value: written.append(value)
+            async with client_of(radio, one) as client:
+                radio.air._latency_s = 1.0
+                await client.write_gatt_char(TALK, b"old", response=False)
+                one.hang_up(CONNECTION_TIMEOUT)
+                await asyncio.sleep(0.01)
+            connection = await radio.connect(one.address, 0.9)
+            assert one.is_connected
+            await asyncio.sleep(2.0)
+            assert written == []
+            await connection.disconnect()
+
+    run(main(), virtual=True)
+
+
+def test_each_peripheral_loses_its_own_share_besides_the_airs() -> None:
+    async def main() -> None:
+        async with air(AirSettings(lost_share=0.2), names=("one", "two")) as (radio, one, two):
+            counts = {"one": 0, "two": 0}
+            async with client_of(radio, one) as first, client_of(radio, two) as second:
+
+                def count(name: str):
+                    def heard(*_) -> None:
+                        counts[name] += 1
+
+                    return heard
+
+                await first.start_notify(TALK, count("one"))
+                await second.start_notify(TALK, count("two"))
+                one.lose(0.5)
+                for _ in range(3000):
+                    one.notify(TALK, b"1")
+                    two.notify(TALK, b"2")
+                    await asyncio.sleep(0.001)
+                # Five standard deviations.
+                assert counts["one"] == pytest.approx(3000 * 0.8 * 0.5, abs=135)
+                assert counts["two"] == pytest.approx(3000 * 0.8, abs=110)
+
+    run(main(), virtual=True)
+
+
+def test_of_two_peripherals_one_falls_silent_and_comes_back() -> None:
+    async def main() -> None:
+        async with air(names=("one", "two")) as (radio, one, two):
+            heard: list[bytes] = []
+            async with client_of(radio, one) as first, client_of(radio, two) as second:
+                for client in (first, second):
+                    await client.start_notify(TALK, lambda _, value: heard.append(bytes(value)))
+                one.fall_silent()
+                for each in (one, two):
+                    each.notify(TALK, each.name.encode())
+                with pytest.raises(TimeoutError):
+                    async with asyncio.timeout(2.0):
+                        await first.write_gatt_char(TALK, b"anybody?", response=True)
+                await second.write_gatt_char(TALK, b"you", response=True)
+                assert heard == [b"two"]
+                assert (first.is_connected, second.is_connected) == (True, True)
+                one.come_back()
+                await asyncio.sleep(0.01)
+                assert (first.is_connected, second.is_connected) == (False, True)
+                await first.connect()
+                assert one.is_connected
+
+    run(main(), virtual=True)
+
+
 def test_a_radio_that_is_off_says_so() -> None:
     async def main() -> None:
         radio = VirtualRadio()
@@ -238,11 +353,12 @@ def test_pairing_is_refused_and_settings_are_checked() -> None:
             assert client.mtu_size == 23
 
     run(main(), virtual=True)
-    for wrong in ({"mtu": 22}, {"mtu": 600}, {"latency_s": -1.0}, {"lost_share": 1.5}):
+    for wrong in ({"mtu": 22}, {"mtu": 600}, {"latency_s": -1.0}, {"lost_share": 1.5}, {"jitter_s": -1.0}):
         with pytest.raises(RequestError):
             AirSettings(**wrong)
-    with pytest.raises(RequestError, match="random generator"):
-        VirtualRadio(AirSettings(lost_share=0.1))
+    for chance in ({"lost_share": 0.1}, {"jitter_s": 0.1}):
+        with pytest.raises(RequestError, match="random generator"):
+            VirtualRadio(AirSettings(**chance))
 
 
 @pytest.mark.slow

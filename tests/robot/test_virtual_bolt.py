@@ -19,24 +19,35 @@ from robot.virtual.body import Body
 from robot.virtual.bolt import BoltSettings, VirtualBolt
 from robot.virtual.radio import AirSettings
 
-# Length of the answer to each command, from the protocol's table; 0 is a bare acknowledgement.
-ANSWER_BYTES = {
-    "API version": 2,
-    "main app version": 6,
-    "bootloader version": 6,
-    "MAC address": 12,
-    "battery voltage": 2,
-    "battery voltage state": 1,
-    "charger state": 1,
-    "streaming mask get": 7,
-    "extended mask get": 4,
-    "ambient light": 4,
-}
-EXAMPLES = {
-    "raw motors": bytes([1, 40, 1, 40]),
-    "drive": bytes([60, 0, 90, 0]),
-    "LEDs": bytes([0x03, 255, 128]),
-    "matrix pixel": bytes([7, 0, 255, 0, 0]),
+# The protocol's table: device, command, target (0: none), a good payload, bytes of the answer's payload.
+TABLE = {
+    "API version": (0x10, 0x01, 0, "", 2),
+    "main app version": (0x11, 0x00, 0, "", 6),
+    "bootloader version": (0x11, 0x01, 0, "", 6),
+    "MAC address": (0x11, 0x06, 0, "", 12),
+    "wake": (0x13, 0x0D, 0, "", 0),
+    "battery voltage": (0x13, 0x03, 0, "", 2),
+    "battery voltage state": (0x13, 0x17, 0, "", 1),
+    "charger state": (0x13, 0x1F, 0, "", 1),
+    "charger notify": (0x13, 0x20, 0, "01", 0),
+    "raw motors": (0x16, 0x01, 0x12, "01 28 01 28", 0),
+    "reset yaw": (0x16, 0x06, 0x12, "", 0),
+    "drive": (0x16, 0x07, 0x12, "3c 01 67 00", 0),
+    "stabilisation": (0x16, 0x0C, 0x12, "05", 0),
+    "LEDs": (0x1A, 0x1C, 0x11, "3f ff 00 00 00 00 ff", 0),
+    "matrix pixel": (0x1A, 0x2D, 0x12, "07 00 ff 00 00", 0),
+    "matrix colour": (0x1A, 0x2F, 0x12, "ff 80 00", 0),
+    "streaming mask": (0x18, 0x00, 0x12, "00 96 00 00 07 00 78", 0),
+    "streaming mask get": (0x18, 0x01, 0x12, "", 7),
+    "extended mask": (0x18, 0x0C, 0x12, "00 04 00 00", 0),
+    "extended mask get": (0x18, 0x0D, 0x12, "", 4),
+    "gyro-max notify": (0x18, 0x0F, 0x12, "01", 0),
+    "configure collision": (0x18, 0x11, 0x12, "01 5a 82 5a 82 01", 0),
+    "reset locator": (0x18, 0x13, 0x12, "", 0),
+    "locator flags": (0x18, 0x17, 0x12, "00", 0),
+    "ambient light": (0x18, 0x30, 0x12, "", 4),
+    "sleep": (0x13, 0x01, 0, "", 0),
+    "deep sleep": (0x13, 0x00, 0, "", 0),
 }
 
 
@@ -88,19 +99,35 @@ def session(bench, script, **options) -> None:
     run(main(), virtual=True)
 
 
-def test_every_command_is_answered_with_its_length(bench) -> None:
-    async def script(_, client: Client) -> None:
-        for command in COMMANDS:
-            if command in (commands.SLEEP, commands.DEEP_SLEEP):
-                continue
-            data = EXAMPLES.get(command.name, bytes(struct.calcsize(f">{command.layout or ''}")))
-            answer = await client.ask(Request(command, data), response=command.did != 0x13)
-            assert (answer.did, answer.cid, answer.error) == (command.did, command.cid, 0), command.name
-            assert len(answer.data) == ANSWER_BYTES.get(command.name, 0), command.name
-            if command.target is None:
-                assert answer.flags == 0x09
+def test_every_command_of_the_table_with_right_short_and_long_payloads(bench) -> None:
+    async def script(b, client: Client) -> None:
+        assert set(TABLE) | {"ping"} == {command.name for command in COMMANDS}
+        for name, (did, cid, target, payload, answer_bytes) in TABLE.items():
+            data = bytes.fromhex(payload)
+
+            async def ask(data: bytes, to: int, did=did, cid=cid) -> Packet:
+                client.seq += 1
+                ids = {"target": to, "source": 0x01} if to else {}
+                return await client.send(Packet(0x3A if to else 0x0A, did, cid, client.seq, data, **ids))
+
+            for wrong in {data[:-1], data + b"\x00"} - {data}:
+                refusal = await ask(wrong, target)
+                assert (refusal.error, refusal.data) == (commands.BAD_LENGTH, b""), name
+            if target:
+                # Its device exists, but the other processor does not have it.
+                assert (await ask(data, 0x11 ^ 0x12 ^ target)).error == commands.BAD_CID, name
+                assert (await ask(data, 0x13)).error == commands.BAD_TARGET, name
+            answer = await ask(data, target)
+            assert (answer.did, answer.cid, answer.error, len(answer.data)) == (did, cid, 0, answer_bytes), name
+            if target:
+                assert (answer.flags, answer.target, answer.source) == (0x39, 0x01, target), name
             else:
-                assert (answer.flags, answer.target, answer.source) == (0x39, 1, command.target)
+                assert (answer.flags, answer.target, answer.source) == (0x09, None, None), name
+            if name == "sleep":
+                assert b.virtual.asleep
+                assert (await ask(b"", 0)).error == commands.TARGET_UNAVAILABLE
+        for word in (b"", b"\xab\x8d\xd8", bytes(300)):
+            assert (await client.ask(Request(commands.PING, word))).data == word
 
     session(bench, script)
 
@@ -122,7 +149,10 @@ def test_what_it_cannot_do_is_refused_with_the_right_code(bench) -> None:
             Request(commands.STABILISATION, b"\x06"),
         ):
             assert (await client.ask(request)).error == commands.BAD_PARAMETER
-        assert (await client.ask(Request(commands.LEDS, b"\x03\x01"))).error == commands.BAD_LENGTH
+        for mask, levels, error in ((0x00, 0, 0), (0x15, 3, 0), (0x15, 2, 5), (0x15, 4, 5), (0x40, 1, 7), (0xFF, 8, 7)):
+            leds = await client.ask(Request(commands.LEDS, bytes([mask] + [9] * levels)))
+            assert leds.error == error, mask
+        assert (await client.ask(Request(commands.LEDS))).error == commands.BAD_LENGTH
 
     session(bench, script)
 
@@ -191,6 +221,37 @@ def test_any_stream_has_its_interval_its_channels_and_its_count(bench) -> None:
     session(bench, script)
 
 
+@pytest.mark.parametrize("interval_ms", [25, 50, 150])
+def test_a_thousand_frames_come_at_the_interval_asked_for(bench, interval_ms: int) -> None:
+    async def script(_, client: Client) -> None:
+        layout = commands.layout_for("core_time", "ambient_lux")
+        await client.ask(commands.stream_extended(layout.extended))
+        client.packets.clear()
+        loop = asyncio.get_running_loop()
+        times: list[float] = []
+        received = client.parser.feed
+
+        def feed(chunk):
+            found = received(chunk)
+            times.extend(loop.time() for packet in found if not packet.is_response)
+            return found
+
+        client.parser.feed = feed
+        began_s = loop.time()
+        await client.ask(commands.stream(interval_ms, layout.primary))
+        for _ in range(6):
+            # Keeps it awake, and must not disturb the rhythm.
+            await asyncio.sleep(interval_ms / 6)
+            await client.ask(commands.drive(30, 1.0))
+        await asyncio.sleep(began_s + interval_ms * 1.0005 - loop.time())
+        assert len(times) == 1000
+        assert np.array(times) - began_s == pytest.approx(interval_ms / 1000 * np.arange(1, 1001), abs=1e-4)
+        told = [layout.decode(packet.data)[0] for packet in client.packets if not packet.is_response]
+        assert told == pytest.approx(times, abs=1e-4)
+
+    session(bench, script)
+
+
 def test_yaw_locator_and_speed_are_those_of_the_body(bench) -> None:
     async def script(b, client: Client) -> None:
         names = ("yaw_deg", "locator_x_m", "locator_y_m", "velocity_x_m_s", "velocity_y_m_s", "speed_m_s")
@@ -246,6 +307,47 @@ def test_leds_show_in_the_body(bench) -> None:
         assert b.body.led_level == pytest.approx(1 / 64)
 
     session(bench, script)
+
+
+@pytest.mark.parametrize("motors", ["01 1e 02 1e", "02 14 01 28", "01 32 00 00", "00 09 01 32"])
+def test_motors_that_differ_spin_it_on_the_spot(bench, motors: str) -> None:
+    async def script(b, client: Client) -> None:
+        data = bytes.fromhex(motors)
+        await client.ask(Request(commands.RAW_MOTORS, data))
+        told_s = asyncio.get_running_loop().time()
+        await asyncio.sleep(0.5)
+        b.body.advance(asyncio.get_running_loop().time())
+        left, right = ((0, units, -units)[mode] for mode, units in (data[:2], data[2:]))
+        turned_rad = 0.59 * (left - right) / 4.0 * (asyncio.get_running_loop().time() - told_s)
+        assert np.exp(1j * b.body.heading_rad) == pytest.approx(np.exp(1j * turned_rad), abs=0.02)
+        assert b.body.distance_cm == 0.0
+        # It stops like one that drives: by command, or for want of one.
+        await client.ask(Request(commands.RAW_MOTORS, bytes(4)))
+        facing_rad = b.body.facing_rad
+        await asyncio.sleep(1.0)
+        b.body.advance(asyncio.get_running_loop().time())
+        assert b.body.facing_rad == pytest.approx(facing_rad)
+
+    session(bench, script, facing_rad=0.0)
+
+
+def test_a_robot_that_hears_no_more_stops_by_itself(bench) -> None:
+    async def script(b, client: Client) -> None:
+        await client.ask(commands.drive(50, 0.0))
+        await asyncio.sleep(1.5)
+        await client.ask(commands.drive(50, 0.0))
+        told_s = asyncio.get_running_loop().time()
+        stood_s = np.inf
+        while not np.isfinite(stood_s):
+            await asyncio.sleep(0.01)
+            now_s = asyncio.get_running_loop().time()
+            b.body.advance(now_s)
+            if b.body.speed_cm_s == 0.0:
+                stood_s = now_s
+        # Two seconds, and the brake from 29.5 cm/s at 80 cm/s².
+        assert stood_s - told_s == pytest.approx(2.0 + 29.5 / 80.0, abs=0.02)
+
+    session(bench, script, position_cm=(-50.0, 0.0), facing_rad=0.0)
 
 
 def test_raw_motors_and_reverse_roll_it(bench) -> None:
@@ -318,7 +420,7 @@ def test_the_battery_state_follows_its_voltage(bench) -> None:
     async def script(b, client: Client) -> None:
         states = []
         for charge in (1.0, 0.2, 0.05):
-            b.body._battery = charge
+            b.body.battery_charge = charge
             states.append((await client.ask(Request(commands.BATTERY_STATE))).data[0])
         assert states == [1, 2, 3]
 
