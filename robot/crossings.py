@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lab.base.errors import ChordlabError
+from robot.micropython.detector import Detector
 
 # Half of the hysteresis: as many noise widths as make a false crossing rarer than 10^-9 a sample, and no more
 # than that, for a chord that never lights the footprint beyond the upper threshold is lost. At the largest
@@ -130,35 +131,23 @@ def learn_levels(dark_lux: ArrayLike, bright_lux: ArrayLike, *, separation: floa
 class CrossingDetector:
     """Crossings of one run after another, sample by sample, in constant memory.
 
-    A crossing is reported once the light reaches the far threshold, and is placed where it passed the middle,
-    linearly between the two samples on either side. On a ramp that noise makes pass the middle several times
-    between the thresholds, it is placed at the mean of those passages: the first alone would come early, the
-    last late. A wiggle that never reaches the far threshold leaves nothing.
-
-    The crossings of a run alternate and begin with an entry: a run that starts in the light has one at its
-    start (returned by ``start``) and a run that ends there has an exit at its end (by ``finish``). What is
-    measured is the part of the shape that the robot can reach.
+    It is the ``Detector`` that also runs on robots of their own mind, whose documentation says where it places
+    a crossing; here it speaks in ``Levels`` and ``Crossing``. The crossings of a run alternate, begin with an
+    entry (at the start, if the run starts in the light) and end with an exit (at the end, if it ends there):
+    what is measured is the part of the shape that the robot can reach.
 
     Samples whose light is not finite are passed over. ``s_cm`` must not decrease within a run.
     """
 
-    __slots__ = ("_last", "_levels", "_lit", "_passages", "_sum_s_cm", "_sum_t_s")
+    __slots__ = ("_detector",)
 
     def __init__(self, levels: Levels) -> None:
-        self._levels = levels
-        self._lit = False
-        self._last: tuple[float, float, float] | None = None
-        self._forget_passages()
+        self._detector = Detector(levels.low_lux, levels.mid_lux, levels.high_lux)
 
     @property
     def lit(self) -> bool:
         """Whether the robot is in the light, as far as confirmed."""
-        return self._lit
-
-    def _forget_passages(self) -> None:
-        self._passages = 0
-        self._sum_t_s = 0.0
-        self._sum_s_cm = 0.0
+        return self._detector.lit
 
     def start(self, t_s: float, s_cm: float, light_lux: float) -> Crossing | None:
         """Begin a run at a sample, whose side of the middle level says whether it starts in the light.
@@ -166,14 +155,7 @@ class CrossingDetector:
         Returns:
             An entry at this very sample if it lies in the light, None in the dark.
         """
-        self._forget_passages()
-        self._lit = False
-        self._last = None
-        if not math.isfinite(light_lux):
-            return None  # the first sample that can be read will begin the run
-        self._last = (t_s, s_cm, light_lux)
-        self._lit = light_lux >= self._levels.mid_lux
-        return Crossing(t_s, s_cm, entering=True) if self._lit else None
+        return _crossing(self._detector.start(t_s, s_cm, light_lux))
 
     def feed(self, t_s: float, s_cm: float, light_lux: float) -> Crossing | None:
         """Take the next sample of the run; the first one of all counts as ``start``.
@@ -181,28 +163,7 @@ class CrossingDetector:
         Returns:
             The crossing that this sample confirms, if any; it lies before the sample.
         """
-        if self._last is None:
-            return self.start(t_s, s_cm, light_lux)
-        if not math.isfinite(light_lux):
-            return None
-        levels = self._levels
-        last_t_s, last_s_cm, last_lux = self._last
-        self._last = (t_s, s_cm, light_lux)
-        if (last_lux >= levels.mid_lux) != (light_lux >= levels.mid_lux):
-            part = (levels.mid_lux - last_lux) / (light_lux - last_lux)
-            self._passages += 1
-            self._sum_t_s += last_t_s + part * (t_s - last_t_s)
-            self._sum_s_cm += last_s_cm + part * (s_cm - last_s_cm)
-        confirmed = light_lux <= levels.low_lux if self._lit else light_lux >= levels.high_lux
-        refuted = light_lux >= levels.high_lux if self._lit else light_lux <= levels.low_lux
-        if confirmed:
-            self._lit = not self._lit
-            crossing = Crossing(self._sum_t_s / self._passages, self._sum_s_cm / self._passages, self._lit)
-            self._forget_passages()
-            return crossing
-        if refuted:  # back where it came from: the ramp, if it was one, begins anew
-            self._forget_passages()
-        return None
+        return _crossing(self._detector.feed(t_s, s_cm, light_lux))
 
     def finish(self, t_s: float, s_cm: float) -> Crossing | None:
         """End the run.
@@ -210,11 +171,11 @@ class CrossingDetector:
         Returns:
             An exit at the end if the run ended in the light, None in the dark.
         """
-        was_lit = self._lit
-        self._lit = False
-        self._last = None
-        self._forget_passages()
-        return Crossing(t_s, s_cm, entering=False) if was_lit else None
+        return _crossing(self._detector.finish(t_s, s_cm))
+
+
+def _crossing(found: tuple[float, float, bool] | None) -> Crossing | None:
+    return None if found is None else Crossing(*found)
 
 
 def crossings_of(t_s: ArrayLike, s_cm: ArrayLike, light_lux: ArrayLike, levels: Levels) -> list[Crossing]:

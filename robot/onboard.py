@@ -9,9 +9,15 @@ of (distance to where it came in)^j - (distance to where it went out)^j::
     over a lit chord c    L3 += 3 C2 c + 3 C1 c^2 + c^3;  C2 += 2 C1 c + c^2;  C1 += c
     at the line's end     L1 = C1
 
+On request C3 and C4 are carried too, for L4 and L5 (binomial theorem; L_n gains what C_n gains in the light).
 From the means over the lines that cross the shape,
 
-    A = (pi/3) <L3>/<L1>,    P = pi A <k>/<L1>.
+    A = (pi/3) <L3>/<L1>,    P = pi A <k>/<L1>,
+    mean distance of two of its points = <L4>/(2 <L3>),    R_g^2 = 3 <L5>/(20 <L3>),
+
+the last two because the integral of L_n over all lines is n (n - 1)/2 times that of r^(n - 3) over all pairs of points.
+Lines that were drawn with unequal probability are each given a weight that undoes it, 1/probability up to a
+common factor: the means are then those of weight (k, L1, L3).
 
 (The paper prints 3/pi in its Eq. 1; a disc's chords, <l> = pi R/2 and <l^3> = 3 pi R^3/2, show that the
 fraction stands on its head.) The signed sums are those of Vlasov, arXiv:0711.4734.
@@ -26,7 +32,36 @@ from array import array
 _NAN = float("nan")
 
 
-class Estimator:
+def _check_weight(weight: float) -> None:
+    if not (weight > 0.0 and math.isfinite(weight)):
+        raise ValueError("a line's weight must be a finite number above 0: check the turning policy")
+
+
+class Precision:
+    """Standard errors of an estimate, from its ``covariance()``."""
+
+    __slots__ = ()
+
+    def covariance(self) -> tuple[float, float, float]:
+        """Variance of A (cm^4), covariance of A and P (cm^3), variance of P (cm^2)."""
+        raise NotImplementedError
+
+    def sigma_area(self) -> float:
+        """Standard error of ``area()`` in cm^2; NaN before the second line."""
+        return math.sqrt(self.covariance()[0])
+
+    def sigma_perimeter(self) -> float:
+        """Standard error of ``perimeter()`` in cm; NaN before the second line."""
+        return math.sqrt(self.covariance()[2])
+
+    def correlation(self) -> float:
+        """Correlation of the errors of area and perimeter; NaN where one of them has no spread."""
+        area_area, area_perimeter, perimeter_perimeter = self.covariance()
+        scale = math.sqrt(area_area) * math.sqrt(perimeter_perimeter)
+        return area_perimeter / scale if scale > 0.0 else _NAN
+
+
+class Estimator(Precision):
     """Running estimate of a shape's area and perimeter.
 
     Per line: ``start_line()``, ``crossing(s_cm, entering)`` for each crossing, then ``end_line(s_cm)``, or
@@ -45,9 +80,14 @@ class Estimator:
     __slots__ = (
         "_c1",
         "_c2",
+        "_c3",
+        "_c4",
         "_comoments",
+        "_higher",
         "_k",
         "_l3",
+        "_l4",
+        "_l5",
         "_lit",
         "_means",
         "_rolling",
@@ -57,12 +97,18 @@ class Estimator:
         "runs",
     )
 
-    def __init__(self, covariance: bool = True):
-        """Start a session; without ``covariance`` six numbers are not kept and the sigmas are NaN."""
+    def __init__(self, covariance: bool = True, higher: bool = False):
+        """Start a session.
+
+        Args:
+            covariance: Keep the six co-moments; without them the sigmas are NaN.
+            higher: Keep L4 and L5 too, six numbers more; without them the two distances are NaN.
+        """
+        self._higher = higher
         self.runs = 0
         self.lines = 0
         self.chords = 0
-        self._means = array("d", [0.0, 0.0, 0.0])  # of (k, L1, L3)
+        self._means = array("d", [0.0] * (5 if higher else 3))  # of weight (k, L1, L3, L4, L5)
         # Sums of products of deviations from the means, the upper triangle by rows: kk, k1, k3, 11, 13, 33.
         self._comoments = array("d", [0.0] * 6) if covariance else None
         self._rolling = False
@@ -74,7 +120,11 @@ class Estimator:
         self._s_cm = 0.0  # of the last crossing
         self._c1 = 0.0
         self._c2 = 0.0
+        self._c3 = 0.0
+        self._c4 = 0.0
         self._l3 = 0.0
+        self._l4 = 0.0
+        self._l5 = 0.0
 
     def start_line(self) -> None:
         """Begin a line, in the dark.
@@ -106,8 +156,12 @@ class Estimator:
         if not (step >= 0.0 and math.isfinite(s_cm)):  # so that a NaN is refused too
             raise ValueError("a crossing lies behind the one before it, or nowhere: drop the line")
         if entering:
+            if self._higher:
+                self._move_on(step)
             self._c2 += 2.0 * step * self._c1
         else:
+            if self._higher:
+                self._pass_chord(step)
             self._l3 += step * (3.0 * self._c2 + step * (3.0 * self._c1 + step))
             self._c2 += step * (2.0 * self._c1 + step)
             self._c1 += step
@@ -115,71 +169,110 @@ class Estimator:
         self._lit = entering
         self._s_cm = s_cm
 
-    def end_line(self, s_cm: float | None = None) -> tuple[int, float, float]:
+    def _move_on(self, gap: float) -> None:
+        """Take C3 and C4 over a dark gap; before C1 and C2 are, and C4 before C3."""
+        c1, c2 = self._c1, self._c2
+        self._c4 += gap * (4.0 * self._c3 + gap * (6.0 * c2 + gap * 4.0 * c1))
+        self._c3 += gap * (3.0 * c2 + gap * 3.0 * c1)
+
+    def _pass_chord(self, chord: float) -> None:
+        """Take L4, L5, C3 and C4 over a lit chord; before C1 and C2 are."""
+        c1, c2, c3 = self._c1, self._c2, self._c3
+        gained = chord * (4.0 * c3 + chord * (6.0 * c2 + chord * (4.0 * c1 + chord)))
+        self._l4 += gained
+        self._l5 += chord * (5.0 * self._c4 + chord * (10.0 * c3 + chord * (10.0 * c2 + chord * (5.0 * c1 + chord))))
+        self._c4 += gained
+        self._c3 += chord * (3.0 * c2 + chord * (3.0 * c1 + chord))
+
+    def end_line(self, s_cm: float | None = None, weight: float = 1.0) -> tuple[int, float, float]:
         """End the line in progress and take it into the session.
 
         Args:
             s_cm: Where the line ended; needed when it ended in the light, to close the last chord.
+            weight: Undoes the probability that such a line had to be drawn.
 
         Returns:
-            (k, L1, L3) of the line: chords, cm, cm^3; (0, 0.0, 0.0) if it met no light.
+            (k, L1, L3) of the line, not weighted: chords, cm, cm^3; (0, 0.0, 0.0) if it met no light.
 
         Raises:
             ValueError: No line is in progress, or it ended in the light and ``s_cm`` is missing or lies
-                before the last crossing.
+                before the last crossing, or the weight is not a finite number above 0. The line is left
+                as it was.
         """
         if not self._rolling:
             raise ValueError("no line is in progress: call start_line first")
+        _check_weight(weight)
         if self._lit:
             if s_cm is None:
                 raise ValueError("the line ended in the light: give end_line its end, or drop the line")
             self.crossing(s_cm, False)
         self._rolling = False
-        self.add_line(self._k, self._c1, self._l3)
+        self.add_line(self._k, self._c1, self._l3, weight, self._l4, self._l5)
         return self._k, self._c1, self._l3
+
+    def higher_of_line(self) -> tuple[float, float]:
+        """(L4, L5) of the line up to its last crossing, cm^4 and cm^5; NaN in a session without ``higher``."""
+        return (self._l4, self._l5) if self._higher else (_NAN, _NAN)
 
     def drop_line(self) -> None:
         """Forget the line in progress, as if it had never been; harmless when there is none."""
         self._rolling = False  # start_line clears what it had gathered
 
-    def add_line(self, k: int, l1_cm: float, l3_cm3: float) -> None:
+    def add_line(
+        self,
+        k: int,
+        l1_cm: float,
+        l3_cm3: float,
+        weight: float = 1.0,
+        l4_cm4: float | None = None,
+        l5_cm5: float | None = None,
+    ) -> None:
         """Take a finished line into the session: the running means and Welford's co-moments.
 
         ``end_line`` calls this; a resumed session calls it with the lines it has stored.
+
+        Raises:
+            ValueError: The weight is not a finite number above 0, or the session keeps the higher
+                invariants and they are missing. The session is left as it was.
         """
+        _check_weight(weight)
+        line = [k * weight, l1_cm * weight, l3_cm3 * weight]
+        if self._higher:
+            if l4_cm4 is None or l5_cm5 is None:
+                raise ValueError("this session keeps L4 and L5: give add_line both, or start it without higher")
+            line += [l4_cm4 * weight, l5_cm5 * weight]
         self.runs += 1
         if k == 0:
             return
         self.lines += 1
         self.chords += k
-        before = (k - self._means[0], l1_cm - self._means[1], l3_cm3 - self._means[2])
-        for i in range(3):
-            self._means[i] += before[i] / self.lines
+        means = self._means
+        before = [line[i] - means[i] for i in range(len(line))]
+        for i in range(len(line)):
+            means[i] += before[i] / self.lines
         if self._comoments is not None:
-            after = (k - self._means[0], l1_cm - self._means[1], l3_cm3 - self._means[2])
             at = 0
             for i in range(3):
                 for j in range(i, 3):
-                    self._comoments[at] += before[i] * after[j]
+                    self._comoments[at] += before[i] * (line[j] - means[j])
                     at += 1
 
     def merge(self, other: "Estimator") -> None:
         """Take in the lines of another robot in the same light: sufficient statistics, never estimates.
 
         The parallel form of Welford's recursion (Chan, Golub and LeVeque 1979). A session without
-        covariance on either side ends without. ``other`` is left as it was.
+        covariance, or without the higher invariants, on either side ends without. ``other`` is left as it was.
         """
         both = self.lines + other.lines
         self.runs += other.runs
         if other._comoments is None:
             self._comoments = None
+        if self._higher and not other._higher:
+            self._higher = False
+            self._means = array("d", [self._means[0], self._means[1], self._means[2]])
         if other.lines == 0:
             return
-        apart = (
-            other._means[0] - self._means[0],
-            other._means[1] - self._means[1],
-            other._means[2] - self._means[2],
-        )
+        apart = [other._means[i] - self._means[i] for i in range(len(self._means))]
         if self._comoments is not None and other._comoments is not None:
             weight = self.lines * other.lines / both
             at = 0
@@ -187,13 +280,13 @@ class Estimator:
                 for j in range(i, 3):
                     self._comoments[at] += other._comoments[at] + weight * apart[i] * apart[j]
                     at += 1
-        for i in range(3):
+        for i in range(len(apart)):
             self._means[i] += apart[i] * other.lines / both
         self.lines = both
         self.chords += other.chords
 
     def means(self) -> tuple[float, float, float]:
-        """Means of (k, L1, L3) over the lines that cross; NaN before the first."""
+        """Means of weight (k, L1, L3) over the lines that cross; NaN before the first."""
         if self.lines == 0:
             return _NAN, _NAN, _NAN
         return self._means[0], self._means[1], self._means[2]
@@ -210,15 +303,33 @@ class Estimator:
             return _NAN
         return math.pi * self.area() * self._means[0] / self._means[1]
 
+    def radius_of_gyration(self) -> float:
+        """Root mean square distance of the shape's points from its centroid, cm, sqrt(3 <L5>/(20 <L3>)).
+
+        NaN before the first line of some length, and in a session without ``higher``.
+        """
+        if not self._higher or self._means[2] == 0.0:
+            return _NAN
+        return math.sqrt(0.15 * self._means[4] / self._means[2])
+
+    def mean_pair_distance(self) -> float:
+        """Mean distance of two points drawn evenly over the shape, cm, <L4>/(2 <L3>).
+
+        NaN before the first line of some length, and in a session without ``higher``.
+        """
+        if not self._higher or self._means[2] == 0.0:
+            return _NAN
+        return 0.5 * self._means[3] / self._means[2]
+
     def covariance(self) -> tuple[float, float, float]:
         """Variance of A (cm^4), covariance of A and P (cm^3), variance of P (cm^2).
 
         Delta method on log A = log<L3> - log<L1> and log P = log<L3> + log<k> - 2 log<L1>, for independent
-        lines. NaN before the second line, and in a session without covariance.
+        lines, weighted or not. NaN before the second line, and in a session without covariance.
         """
         if self._comoments is None or self.lines < 2 or not (self._means[1] > 0.0 and self._means[2] > 0.0):
             return _NAN, _NAN, _NAN
-        k, l1, l3 = self._means
+        k, l1, l3 = self.means()
         kk, k1, k3, m11, m13, m33 = self._comoments
         # Relative co-moments; the variance of a mean is the comoment / (N (N - 1)).
         scale = 1.0 / (self.lines * (self.lines - 1.0))
@@ -233,17 +344,3 @@ class Estimator:
             area_perimeter * area * perimeter,
             max(0.0, perimeter_perimeter) * perimeter * perimeter,
         )
-
-    def sigma_area(self) -> float:
-        """Standard error of ``area()`` in cm^2; NaN before the second line."""
-        return math.sqrt(self.covariance()[0])
-
-    def sigma_perimeter(self) -> float:
-        """Standard error of ``perimeter()`` in cm; NaN before the second line."""
-        return math.sqrt(self.covariance()[2])
-
-    def correlation(self) -> float:
-        """Correlation of the errors of area and perimeter; NaN where one of them has no spread."""
-        area_area, area_perimeter, perimeter_perimeter = self.covariance()
-        scale = math.sqrt(area_area) * math.sqrt(perimeter_perimeter)
-        return area_perimeter / scale if scale > 0.0 else _NAN
