@@ -23,7 +23,7 @@ from analysis.invariants import area_cm2, perimeter_cm
 from analysis.kernels import ragged_sampled, ragged_sort
 from analysis.montecarlo import Lines, simulate_crossings
 from analysis.quadrature import Moments
-from analysis.recognition import log_prior, normalised, rank
+from analysis.recognition import Weights, crossing_lines, log_prior, normalised, rank
 from lab.base.errors import RequestError
 
 Floats = NDArray[np.float64]
@@ -191,21 +191,25 @@ class LineRecogniser:
         """Forget every line."""
         self._n = 0
         self._log_likelihood = np.zeros(len(self.names))
+        self._weights = Weights()
 
-    def update(self, k: int, l1_cm: float, l3_cm3: float) -> None:
+    def update(self, k: int, l1_cm: float, l3_cm3: float, weight: float = 1.0) -> None:
         """Take in one line; k = 0 changes nothing."""
-        self.update_many([k], [l1_cm], [l3_cm3])
+        self.update_many([k], [l1_cm], [l3_cm3], weight)
 
-    def update_many(self, k: ArrayLike, l1_cm: ArrayLike, l3_cm3: ArrayLike) -> None:
+    def update_many(self, k: ArrayLike, l1_cm: ArrayLike, l3_cm3: ArrayLike, weight: ArrayLike = 1.0) -> None:
         """Take in many lines, arrays of shape (lines,)."""
-        values = np.column_stack([np.asarray(column, dtype=float).ravel() for column in (k, l1_cm, l3_cm3)])
-        crossing = values[values[:, 0] >= 1]
-        self._n += len(crossing)
-        self._log_likelihood += self._weight * self._tables.look_up(*crossing.T).sum(axis=0)
+        lines = crossing_lines(k, l1_cm, l3_cm3, weight)
+        self._n += len(lines)
+        self._log_likelihood += (lines[:, 3:] * self._tables.look_up(*lines[:, :3].T)).sum(axis=0)
+        self._weights.take(lines[:, 3])
 
     def posterior(self) -> dict[str, float]:
         """Probability of each entry; they sum to 1."""
-        return normalised(self.names, self._log_prior + self._log_likelihood)
+        weights = self._weights
+        # As many lines of equal weight as these are worth, each of the weighted mean's likelihood.
+        scale = self._weight * weights.effective_lines / weights.total if weights.total else 0.0
+        return normalised(self.names, self._log_prior + scale * self._log_likelihood)
 
     def ranked(self) -> list[tuple[str, float]]:
         """(name, probability), the most probable first."""

@@ -35,12 +35,16 @@ class Recogniser(Protocol):
         """Crossing lines taken in so far."""
         ...
 
-    def update(self, k: int, l1_cm: float, l3_cm3: float) -> None:
-        """Take in one line. A line with k = 0 did not cross the shape and changes nothing."""
+    def update(self, k: int, l1_cm: float, l3_cm3: float, weight: float = 1.0) -> None:
+        """Take in one line. A line with k = 0 did not cross the shape and changes nothing.
+
+        ``weight`` undoes an unequal chance of being drawn. Lines of unequal weights count as (Σw)²/Σw² equal
+        ones (Kish's effective sample size).
+        """
         ...
 
-    def update_many(self, k: ArrayLike, l1_cm: ArrayLike, l3_cm3: ArrayLike) -> None:
-        """Take in many lines, arrays of shape (lines,)."""
+    def update_many(self, k: ArrayLike, l1_cm: ArrayLike, l3_cm3: ArrayLike, weight: ArrayLike = 1.0) -> None:
+        """Take in many lines, arrays of shape (lines,); ``weight`` is one number or (lines,)."""
         ...
 
     def posterior(self) -> dict[str, float]:
@@ -54,6 +58,35 @@ class Recogniser(Protocol):
     def reset(self) -> None:
         """Forget every line."""
         ...
+
+
+class Weights:
+    """Running sums of the lines' weights."""
+
+    __slots__ = ("squares", "total")
+
+    def __init__(self) -> None:
+        self.total = 0.0
+        self.squares = 0.0
+
+    def take(self, weight: ArrayLike) -> None:
+        """Take in the weight of one line, or of many."""
+        values = np.asarray(weight, dtype=float)
+        self.total += float(values.sum())
+        self.squares += float((values * values).sum())
+
+    @property
+    def effective_lines(self) -> float:
+        """Number of lines of equal weight that would tell as much, (Σw)²/Σw²; 0 before the first."""
+        return self.total * self.total / self.squares if self.squares else 0.0
+
+
+def crossing_lines(k: ArrayLike, l1_cm: ArrayLike, l3_cm3: ArrayLike, weight: ArrayLike) -> Floats:
+    """The lines with k ≥ 1 as rows (k, 𝓛_1, 𝓛_3, weight)."""
+    columns = [np.asarray(column, dtype=float).ravel() for column in (k, l1_cm, l3_cm3)]
+    weights = np.broadcast_to(np.asarray(weight, dtype=float), columns[0].shape)
+    values = np.column_stack([*columns, weights])
+    return values[values[:, 0] >= 1]
 
 
 class GaussianRecogniser:
@@ -90,26 +123,29 @@ class GaussianRecogniser:
         """Forget every line."""
         self._n = 0
         self._sums = np.zeros(3)
+        self._weights = Weights()
 
-    def update(self, k: int, l1_cm: float, l3_cm3: float) -> None:
+    def update(self, k: int, l1_cm: float, l3_cm3: float, weight: float = 1.0) -> None:
         """Take in one line; k = 0 changes nothing."""
         if k >= 1:
             self._n += 1
-            self._sums += (k, l1_cm, l3_cm3)
+            self._sums += weight * np.array((k, l1_cm, l3_cm3))
+            self._weights.take(weight)
 
-    def update_many(self, k: ArrayLike, l1_cm: ArrayLike, l3_cm3: ArrayLike) -> None:
+    def update_many(self, k: ArrayLike, l1_cm: ArrayLike, l3_cm3: ArrayLike, weight: ArrayLike = 1.0) -> None:
         """Take in many lines, arrays of shape (lines,)."""
-        values = np.column_stack([np.asarray(column, dtype=float).ravel() for column in (k, l1_cm, l3_cm3)])
-        crossing = values[values[:, 0] >= 1]
-        self._n += len(crossing)
-        self._sums += crossing.sum(axis=0)
+        lines = crossing_lines(k, l1_cm, l3_cm3, weight)
+        self._n += len(lines)
+        self._sums += (lines[:, 3:] * lines[:, :3]).sum(axis=0)
+        self._weights.take(lines[:, 3])
 
     def posterior(self) -> dict[str, float]:
         """Probability of each entry from the running means; the prior before `FIRST_POSTERIOR_N` lines."""
         if self._n < FIRST_POSTERIOR_N:
             return normalised(self.names, self._log_prior)
-        k, l1, l3 = self._sums / self._n
-        return self.posterior_at(float(area_cm2(l1, l3)), float(perimeter_cm(k, l1, l3)), self._n)
+        k, l1, l3 = self._sums / self._weights.total
+        effective = self._weights.effective_lines
+        return self.posterior_at(float(area_cm2(l1, l3)), float(perimeter_cm(k, l1, l3)), effective)
 
     def ranked(self) -> list[tuple[str, float]]:
         """(name, probability), the most probable first."""

@@ -9,41 +9,31 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lab.pictures import Picture, Pictures, check_on_floor, draw_pictures
 from lab.settings import Settings
 from lab.world import virtual_world
 from projector.device import ProjectorDevice, open_projector
-from projector.render import render
-from projector.shape import Shape, check_fits
+from projector.shape import Shape
 from robot.bolt import Bolt
 from robot.device import RobotDevice
-from robot.profile import RobotProfile
+from robot.selfguided import SelfGuided
 from tracking.cameras import Camera, open_camera
 from tracking.recorder import Recorder
 
-Picture = NDArray[np.uint8]
 _PUMP_EVERY_S = 0.5
-SHAPE_MARGIN_CM = 4.0  # a ball's radius and a little: what lies nearer to the wall, the sensor never reaches
-
-
-@dataclass(frozen=True, slots=True)
-class Pictures:
-    """What a session projects: the shape, and the two pictures from which the light levels are learnt."""
-
-    shape: Picture
-    black: Picture
-    white: Picture
 
 
 @dataclass(frozen=True, slots=True)
 class Bench:
     """Open devices. ``recorder`` is None for a session without a camera.
 
-    ``cruising_cm_s`` is the speed that the robot will really be told: its command counts in whole units.
+    ``robots`` is empty where the robot estimates by itself, and ``guest`` is that robot. ``cruising_cm_s`` is
+    the speed that the robots will really be told: their command counts in whole units.
     """
 
-    robot: RobotDevice
+    robots: tuple[RobotDevice, ...]
+    guest: SelfGuided | None
     projector: ProjectorDevice
     camera: Camera | None
     recorder: Recorder | None
@@ -85,27 +75,30 @@ async def open_bench(settings: Settings, shape: Shape, seed: np.random.SeedSeque
         RenderError: the projector cannot show all of it.
         ChordlabError: a device cannot be opened; the line says which and why.
     """
-    check_fits(shape, settings.arena.polygon, SHAPE_MARGIN_CM)
+    check_on_floor(shape, settings.arena)
     optics = settings.projector_optics.pinhole()
-    profile = RobotProfile(cm_s_per_unit=settings.motion.cm_s_per_unit)
+    profile = settings.profile()
+    guest: SelfGuided | None = None
     async with AsyncExitStack() as stack:
         if settings.is_virtual:
             world = await stack.enter_async_context(virtual_world(settings, seed, profile))
-            robot, projector, camera = world.robot, world.projector, world.camera
+            robots, guest, projector, camera = world.robots, world.guest, world.projector, world.camera
         else:
-            robot = Bolt(settings.robot.removeprefix("ble:"), profile=profile)
+            addresses = {kind: address for kind, _, address in (robot.partition(":") for robot in settings.robots)}
+            if "onboard" in addresses:
+                robots, guest = (), SelfGuided(addresses["onboard"], profile=profile)
+            else:
+                robots = tuple(Bolt(robot.removeprefix("ble:"), profile=profile) for robot in settings.robots)
             projector = open_projector(settings.projector, image_size=optics.image_size)
             camera = None if settings.camera == "none" else open_camera(settings.camera)
         stack.callback(projector.close)
         window = asyncio.create_task(_keep_alive(projector))
         stack.callback(window.cancel)
-        width_px, height_px = projector.image_size
-        pictures = Pictures(
-            shape=render(shape.geometry, optics, settings.sensor.height_cm),
-            black=np.zeros((height_px, width_px), dtype=np.uint8),
-            white=np.full((height_px, width_px), 255, dtype=np.uint8),
+        pictures = draw_pictures(
+            shape.geometry, settings.arena, optics, settings.sensor.height_cm, projector.image_size
         )
-        stack.push_async_callback(robot.disconnect)
+        for device in (*robots, *((guest,) if guest is not None else ())):
+            stack.push_async_callback(device.disconnect)
         recorder = None
         if camera is not None:
             recorder = Recorder(camera)
@@ -113,4 +106,4 @@ async def open_bench(settings: Settings, shape: Shape, seed: np.random.SeedSeque
             stack.push_async_callback(recorder.stop)
             settings.camera_calibration().check_size(camera.size)
         cruising_cm_s = profile.cm_s_per_unit * profile.speed_units(settings.motion.speed_cm_s)
-        yield Bench(robot, projector, camera, recorder, pictures, cruising_cm_s)
+        yield Bench(robots, guest, projector, camera, recorder, pictures, cruising_cm_s)

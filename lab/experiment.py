@@ -19,12 +19,16 @@ from analysis.recognition import Recogniser
 from lab.base.errors import ChordlabError
 from lab.bench import Bench, open_bench
 from lab.clock import run as run_on_clock
+from lab.ledger import Watcher
+from lab.listening import Listening
 from lab.recognisers import recogniser_for
-from lab.session import Outcome, Preflight, Session, Watcher
+from lab.roller import SessionLevels
+from lab.session import Outcome, Preflight, Session
 from lab.settings import Settings
 from lab.store import SessionWriter, disk_faults
 from projector.dictionary import load_dictionary, shape_from
 from projector.shape import Shape
+from robot.device import Identity
 
 _VERSIONED = ("chordlab", "numpy", "shapely", "opencv-python-headless", "bleak", "bumble", "filterpy", "numba", "av")
 
@@ -76,17 +80,14 @@ def run_experiment(
 
     async def on_the_bench() -> None:
         async with open_bench(settings, shape, world_seed) as bench:
-            session = Session(bench, settings, recogniser, np.random.default_rng(turn_seed), watch=watch)
+            session = _session(bench, settings, recogniser, turn_seed, watch=watch, say=say)
             preflight = await session.preflight()
-            say(
-                f"{preflight.identity.name}: firmware {preflight.identity.firmware}, "
-                f"battery {preflight.identity.battery_v:.2f} V; dark {preflight.levels.dark_lux:.0f} lux, "
-                f"lit {preflight.levels.bright_lux:.0f} lux"
-            )
+            for identity, levels in zip(preflight.identities, preflight.levels, strict=True):
+                say(_introduction(identity, levels))
             manifest = _manifest(settings, shape, dictionary, bench, preflight, recogniser, started)
             tag = hashlib.sha256(str(sorted(manifest.items())).encode()).hexdigest()[:4]
             kept.writer = SessionWriter.create(settings.out, shape.name, manifest, started=started, tag=tag)
-            kept.outcome = await session.roll(kept.writer, preflight.levels)
+            kept.outcome = await session.roll(kept.writer, preflight)
 
     interrupted, failure = False, None
     with ExitStack() as stack:
@@ -105,6 +106,31 @@ def run_experiment(
     if kept.writer is None:  # not reached: without a folder the block above raised
         raise ChordlabError("the session left no folder; run chordlab doctor")
     return Finished(kept.writer.folder, kept.outcome, interrupted, failure)
+
+
+def _session(
+    bench: Bench,
+    settings: Settings,
+    recogniser: Recogniser,
+    turn_seed: np.random.SeedSequence,
+    *,
+    watch: Watcher | None,
+    say: Callable[[str], None],
+) -> Session | Listening:
+    """What leads the session: this program, or a robot that estimates by itself and is listened to."""
+    if bench.guest is not None:
+        return Listening(bench, bench.guest, settings, recogniser, turn_seed, watch=watch, say=say)
+    robots = len(bench.robots)
+    seeds = [turn_seed] if robots == 1 else turn_seed.spawn(robots)
+    return Session(bench, settings, recogniser, [np.random.default_rng(seed) for seed in seeds], watch=watch, say=say)
+
+
+def _introduction(identity: Identity, levels: SessionLevels | None) -> str:
+    """One line on a robot that is ready."""
+    text = f"{identity.name}: firmware {identity.firmware}, battery {identity.battery_v:.2f} V"
+    if levels is None:
+        return f"{text}; it learns its light levels by itself"
+    return f"{text}; dark {levels.shape.dark_lux:.0f} lux, lit {levels.shape.bright_lux:.0f} lux"
 
 
 def _manifest(
@@ -132,8 +158,16 @@ def _manifest(
         },
         "dictionary": {name: entry.digest for name, entry in sorted(dictionary.items())},
         "recogniser": type(recogniser).__name__,
-        "levels": asdict(preflight.levels),
-        "devices": {"robot": asdict(preflight.identity), **bench.devices()},
+        "levels": None if preflight.levels[0] is None else asdict(preflight.levels[0].shape),
+        "devices": {
+            "robot": asdict(preflight.identities[0]),
+            "robots": [
+                {**asdict(identity), "levels": None if levels is None else asdict(levels)}
+                for identity, levels in zip(preflight.identities, preflight.levels, strict=True)
+            ],
+            "profile": asdict(settings.profile()),
+            **bench.devices(),
+        },
         "calibration": {
             "camera": settings.camera_calibration().to_dict(),
             "projector": settings.projector_optics.pinhole().to_dict(),

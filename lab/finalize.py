@@ -12,17 +12,25 @@ from lab.store import SessionFolderError, SessionReader
 
 LINE_COLUMNS = {
     "line": "int64",
+    "robot": "str",
     "t_start_s": "float64",
     "t_rolling_s": "float64",
     "t_end_s": "float64",
     "length_cm": "float64",
+    "end_cm": "float64",
     "speed_cm_s": "float64",
     "k": "int64",
     "l1_cm": "float64",
     "l3_cm3": "float64",
     "ended": "str",
     "counts": "bool",
+    "whole": "bool",
+    "weight": "float64",
+    "starts_lit": "bool",
+    "ends_lit": "bool",
 }
+# What the lines of a log of schema 1 do not say: they were all of one robot, and whole.
+_SCHEMA_1 = {"robot": "", "weight": 1.0, "starts_lit": False, "ends_lit": False}
 CROSSING_COLUMNS = {"line": "int64", "order": "int64", "t_s": "float64", "s_cm": "float64", "entering": "bool"}
 ESTIMATE_COLUMNS = {
     "n": "int64",
@@ -57,11 +65,13 @@ def tables_of(session: SessionReader) -> Tables:
     lines: list[dict[str, Any]] = []
     crossings: list[dict[str, Any]] = []
     estimates: list[dict[str, Any]] = []
+    absent = _SCHEMA_1 if session.schema_version == 1 else {}
     for event in session.events():
         if event["event"] != "line":
             continue
         try:
-            lines.append({name: event[name] for name in LINE_COLUMNS})
+            known = {**absent, "whole": event["counts"], "end_cm": event["length_cm"], **event} if absent else event
+            lines.append({name: known[name] for name in LINE_COLUMNS})
             for order, (t_s, s_cm, entering) in enumerate(event["crossings"]):
                 crossings.append(
                     {"line": event["line"], "order": order, "t_s": t_s, "s_cm": s_cm, "entering": entering}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,16 +18,20 @@ from analysis.figures.values import Band, Entry, Isotropy
 from analysis.invariants import invariants_table
 from analysis.montecarlo import available_cores, running_bands
 from analysis.quadrature import Moments, exact_moments
-from analysis.report.result import SessionResult
+from analysis.report.result import RunCheck, SessionResult
 from analysis.report.verdict import verdict_of
 from analysis.report.write import write_report
 from lab.base.errors import RequestError
 from lab.experiment import dictionary_with
 from lab.finalize import Tables, finalize
 from lab.recognisers import recogniser_for
+from lab.runcheck import check_runs
+from lab.session import CONTACT_WINDOW_S
 from lab.settings import Settings, parse_settings
 from lab.store import REPORT, SessionReader
+from lab.tally import stored_estimate
 from projector.shape import Shape, Silhouette
+from robot.contacts import contacts_among
 from tracking.calibration import Calibration
 from tracking.isotropy import IsotropyReport, TooFewLinesError, examine_lines
 from tracking.linespace import LineSpace
@@ -74,6 +79,7 @@ class Reviewed:
     posteriors: pd.DataFrame
     robot: Estimate | None
     filmed: Filmed | None
+    runs: RunCheck | None
 
 
 def stored_shape(session: SessionReader) -> Shape:
@@ -111,10 +117,11 @@ def examine(folder: Path, *, workers: int | None = None, progress: Progress | No
         titles={name: entry.title for name, entry in dictionary.items()},
         ranking=ranking,
         posteriors=posteriors,
-        robot=_estimate(_counted(tables)),
+        robot=stored_estimate(tables.lines, tables.crossings),
         filmed=_filmed(
             session, settings, shape.geometry, tables, rng, workers or max(1, available_cores() // 2), progress
         ),
+        runs=check_runs(tables.lines, shape.geometry, settings, rng),
     )
 
 
@@ -128,8 +135,10 @@ def _recognised(
 ) -> tuple[list[tuple[str, float]], pd.DataFrame]:
     recogniser = recogniser_for(dictionary, settings)
     rows: list[dict[str, float]] = []
-    for n, (k, l1_cm, l3_cm3) in enumerate(_counted(tables)[["k", "l1_cm", "l3_cm3"]].to_numpy(), start=1):
-        recogniser.update(int(k), l1_cm, l3_cm3)
+    counted = _counted(tables)[["whole", "k", "l1_cm", "l3_cm3", "weight"]]
+    for n, (whole, k, l1_cm, l3_cm3, weight) in enumerate(counted.itertuples(index=False), start=1):
+        if whole:
+            recogniser.update(k, l1_cm, l3_cm3, weight)
         rows.append({"n": n, **recogniser.posterior()})
     return recogniser.ranked(), pd.DataFrame(rows, columns=["n", *recogniser.names])
 
@@ -158,7 +167,7 @@ def _filmed(
         return None
     calibration = Calibration.from_dict(session.manifest["calibration"]["camera"])
     track = track_segments(segments, calibration, workers=workers, progress=progress)
-    track = _on_host_clock(track, segments)
+    track = on_host_clock(track, segments)
     track.to_parquet(session.folder / "track.parquet", index=False)
     counts = tables.lines.loc[tables.lines["counts"], "line"]
     lines = fit_lines(track)
@@ -170,7 +179,7 @@ def _filmed(
             lines["theta_rad"],
             lines["p_cm"],
             lines["length_cm"],
-            settings.arena.reachable,
+            settings.arena.lines_within,
             rng,
             shortest_cm=SHORTEST_RUN_CM,
         )
@@ -186,7 +195,7 @@ def _filmed(
     )
 
 
-def _on_host_clock(track: pd.DataFrame, segments: Mapping[int, Path]) -> pd.DataFrame:
+def on_host_clock(track: pd.DataFrame, segments: Mapping[int, Path]) -> pd.DataFrame:
     """Move each segment's times from the camera's clock to the host's, which stamped the robot's crossings."""
     shift_s: dict[int, float] = {}
     for line, video in segments.items():
@@ -211,6 +220,7 @@ def summarise(found: Reviewed, result: SessionResult) -> dict[str, Any]:
         "chords": None if match is None else match.to_dict(),
         "isotropy": None if isotropy is None else {"p_value": isotropy.isotropy_p, "bias": isotropy.bias},
         "homogeneity": None if isotropy is None else {"p_value": isotropy.homogeneity_p},
+        "run_lengths": None if found.runs is None else _run_figures(found.runs),
         "verdict": verdict_of(result).headline,
     }
 
@@ -225,6 +235,17 @@ def _figures(found: Estimate | None) -> dict[str, Any] | None:
         "sigma_perimeter_cm": found.sigma_perimeter_cm,
         "correlation": found.correlation,
         "lines": found.n,
+    }
+
+
+def _run_figures(check: RunCheck) -> dict[str, Any]:
+    lengths, bias = check.lengths, check.bias
+    return {
+        "mean_cm": lengths.mean_cm,
+        "expected_cm": lengths.expected_cm,
+        "p_value": lengths.p_value,
+        "exponent": None if math.isnan(lengths.exponent) else lengths.exponent,
+        "bias": None if bias is None else {"area_rel": bias.area_rel, "perimeter_rel": bias.perimeter_rel},
     }
 
 
@@ -254,7 +275,8 @@ def to_result(found: Reviewed, host: Mapping[str, Any] | None = None) -> Session
         chord_pairs=filmed.match.pairs if filmed else None,
         chords_missed=filmed.match.missed if filmed else None,
         chords_extra=filmed.match.extra if filmed else None,
-        isotropy=_isotropy(filmed, found.settings.arena.reachable) if filmed else None,
+        isotropy=_isotropy(filmed, found.settings.arena.lines_within) if filmed else None,
+        runs_check=found.runs,
         session=found.session.folder.name,
         provenance={
             "session": {
@@ -298,6 +320,12 @@ def _warnings(found: Reviewed) -> list[str]:
     given_up = int(lines["ended"].isin(["timeout", "stall"]).sum())
     if given_up > 0.02 * len(lines):
         said.append(f"{given_up} of {len(lines)} runs reached no wall and are left out: was the robot stuck or lifted?")
+    if len(found.settings.robots) > 1:
+        met = lines[lines["ended"].isin(["bump", "contact"])].sort_values("t_end_s")
+        bumps = {str(robot): own["t_end_s"].tolist() for robot, own in met.groupby("robot")}
+        flags, by_chance = contacts_among(bumps, CONTACT_WINDOW_S)
+        contacts, walls = sum(map(sum, flags.values())), sum(by_chance.values())
+        said.append(f"The robots met {contacts} times, some {walls:.0f} of which were walls hit by two at once.")
     if found.filmed is not None:
         unseen = int(lines["counts"].sum()) - len(found.filmed.lines)
         if unseen > 0.05 * len(lines):

@@ -8,28 +8,27 @@ from __future__ import annotations
 
 import math
 import tomllib
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, cast
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 from shapely import Point, Polygon, box
 
 from lab.base.errors import RequestError
 from lab.base.pinhole import Pinhole
+from lab.physics import Fraction, Positive, Section, VirtualSettings
+from robot.profile import RobotProfile, load_profile
+from robot.turning import Policy, Weighting, check_weighting
 from tracking.calibration import Calibration, load_calibration
 
 BALL_RADIUS_CM = 3.65  # a Sphero BOLT is 73 mm across
-
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Fraction = Annotated[float, Field(ge=0, le=1)]
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+_VIRTUAL_ROBOTS = ("virtual", "onboard:virtual")
+_MOST_ROBOTS = 8
 
 
-class ArenaSettings(_Section):
+class ArenaSettings(Section):
     """The walled floor that the robot rolls on, centred at the origin."""
 
     kind: Literal["rectangle", "disc"] = "rectangle"
@@ -40,6 +39,11 @@ class ArenaSettings(_Section):
     """Inner height between the walls, of a rectangle."""
     radius_cm: Positive = 60.0
     """Inner radius of the wall, of a disc."""
+    edge: Literal["bump", "dark_ring", "bright_ring"] = "bump"
+    """What ends a run: a `bump` into the wall, or a ring of light along it: a `dark_ring` (around a dim floor) or a
+    `bright_ring`."""
+    ring_cm: Annotated[float, Field(ge=3, le=50)] = 10.0
+    """Width of the ring along the wall, of an edge by light; wide enough to brake in."""
 
     @property
     def polygon(self) -> Polygon:
@@ -56,23 +60,51 @@ class ArenaSettings(_Section):
             raise RequestError(f"the arena is too small for a ball of {2 * BALL_RADIUS_CM:g} cm; widen [arena]")
         return inner
 
+    @property
+    def lines_within(self) -> Polygon:
+        """Where the runs lie: ``reachable``, or what the ring leaves of the floor, cm."""
+        if self.edge == "bump":
+            return self.reachable
+        inner = self.polygon.buffer(-self.ring_cm, join_style="mitre")
+        if inner.is_empty:
+            raise RequestError(
+                f"the arena is too small for a ring of {self.ring_cm:g} cm; widen [arena] or lower ring_cm"
+            )
+        return inner
 
-class MotionSettings(_Section):
+    @property
+    def longest_line_cm(self) -> float:
+        """Length of the longest line from edge to edge: the diagonal, or the diameter."""
+        left, bottom, right, top = self.lines_within.bounds
+        return right - left if self.kind == "disc" else math.hypot(right - left, top - bottom)
+
+    @property
+    def ring(self) -> Polygon | None:
+        """The lit or dark band along the wall, cm; None where runs end at the wall itself."""
+        if self.edge == "bump":
+            return None
+        return Polygon(self.polygon.exterior, [self.lines_within.exterior])
+
+
+class MotionSettings(Section):
     """How the robot rolls and turns."""
 
     speed_cm_s: Annotated[float, Field(gt=0, le=150)] = 15.0
     """Cruising speed. The paper rolls at 1 cm/s; at most 150 cm/s."""
-    turning: Literal["lambert", "uniform"] = "lambert"
-    """How it turns at the wall: `lambert` (cosine law: isotropic uniform lines) or `uniform` (biased, to show it)."""
-    cm_s_per_unit: Annotated[float, Field(gt=0, le=10)] = 0.59
-    """Speed of one unit of the drive command's speed byte on this floor; from chord lengths against the camera's."""
+    turning: Policy = Policy.LAMBERT
+    """How it turns: `lambert` (cosine law at the edge: isotropic uniform lines), `uniform` (biased, to show it), or
+    `interior` (random interior stops: needs no wall direction, takes twice the way)."""
+    weighting: Weighting = Weighting.NONE
+    """`run_length` undoes what `uniform` does wrong, in a disc arena; refused elsewhere, where it would not."""
+    cm_s_per_unit: Annotated[float, Field(gt=0, le=10)] | None = None
+    """Speed of one unit of the drive command's speed byte on this floor; none: the robot profile's."""
     run_timeout_s: Positive = 60.0
     """A run without a bump for this long is given up: the robot is stuck or lifted."""
     length_from: Literal["time", "odometry"] = "time"
     """What chord lengths come from: elapsed time × speed, as in the paper, or the wheels. Both are recorded."""
 
 
-class SensorSettings(_Section):
+class SensorSettings(Section):
     """The light sensor and its stream."""
 
     interval_s: Annotated[float, Field(ge=0.025, le=1)] = 0.05
@@ -81,7 +113,18 @@ class SensorSettings(_Section):
     """Height of the light sensor above the floor: the plane for which shapes are projected."""
 
 
-class LedSettings(_Section):
+class LinkSettings(Section):
+    """What a session does when the radio link or the battery gives out."""
+
+    reconnect_s: Annotated[float, Field(ge=0, le=3600)] = 60.0
+    """How long a robot whose link broke is called back before the session ends; 0: not at all."""
+    battery_low_v: Annotated[float, Field(ge=3, le=4.2)] = 3.5
+    """Below this voltage the session pauses, or a tired robot would roll crooked lines."""
+    charge_wait_s: Annotated[float, Field(ge=0, le=86_400)] = 7200.0
+    """How long a pause waits for a charged battery before the session ends."""
+
+
+class LedSettings(Section):
     """The light on the robot that the camera follows."""
 
     dark_level: Fraction = 0.25
@@ -92,7 +135,7 @@ class LedSettings(_Section):
     """Height of the LED above the floor."""
 
 
-class OpticsSettings(_Section):
+class OpticsSettings(Section):
     """Where a camera or projector hangs: a calibration file, or a pose measured by hand."""
 
     calibration: Path | None = None
@@ -133,7 +176,7 @@ def _projector_optics() -> OpticsSettings:
     return OpticsSettings(image_size=(1920, 1080), height_cm=250.0, field_width_cm=200.0)
 
 
-class StopSettings(_Section):
+class StopSettings(Section):
     """When a session ends."""
 
     lines: Annotated[int, Field(ge=1, le=10_000_000)] = 150
@@ -144,42 +187,18 @@ class StopSettings(_Section):
     """Never stop on the posterior before this many crossing lines."""
 
 
-class VirtualSettings(_Section):
-    """The physical world of the virtual bench: what the devices do not know."""
-
-    speed_error_sigma: Fraction = 0.02
-    """Relative error of each run's speed, one standard deviation."""
-    heading_drift_rad_per_cm: Annotated[float, Field(ge=0, le=0.1)] = 0.0002
-    """Curvature of a run, one standard deviation."""
-    footprint_cm: Annotated[float, Field(ge=0, le=5)] = 0.3
-    """Radius of the floor patch that the light sensor averages over."""
-    light_noise_lux: Annotated[float, Field(ge=0)] = 1.0
-    """Noise of one light sample, one standard deviation."""
-    ambient_lux: Annotated[float, Field(ge=0)] = 15.0
-    """Room light."""
-    black_lux: Annotated[float, Field(ge=0)] = 5.0
-    """What the projector throws where its picture is black."""
-    white_lux: Positive = 105.0
-    """What the projector throws where its picture is white."""
-    blur_px: Annotated[float, Field(ge=0, le=50)] = 1.0
-    """Defocus of the projector, one standard deviation in its own pixels."""
-    camera_noise: Annotated[float, Field(ge=0, le=50)] = 2.0
-    """Noise of the camera in grey levels, one standard deviation."""
-    camera_rate_hz: Annotated[float, Field(ge=1, le=240)] = 30.0
-    """Frames a second."""
-    camera_drop_probability: Fraction = 0.002
-    """Chance that a frame is lost."""
-
-
-class Settings(_Section):
+class Settings(Section):
     """One session: what is projected, who rolls and watches, and when it ends."""
 
     shape: str = "eiffel"
     """A dictionary name, `text:WORD`, or a .geojson, .svg or .png file."""
     seed: Annotated[int, Field(ge=0)] = 1
     """Everything random follows from it."""
-    robot: str = "virtual"
-    """`ble:SB-1234` or `virtual`."""
+    robot: str | tuple[str, ...] = "virtual"
+    """`ble:SB-1234`, `virtual`, or a list of them; `onboard:CL-1234` listens to a robot that estimates by itself
+    (`onboard:virtual` on the virtual bench)."""
+    robot_profile: Path | None = None
+    """A robot-profile.toml, as `chordlab robot characterise` writes it; none: the facts known of every BOLT."""
     camera: str = "virtual"
     """`usb:0`, `file:video.mkv`, `virtual`, or `none`."""
     projector: str = "virtual"
@@ -192,6 +211,7 @@ class Settings(_Section):
     arena: ArenaSettings = ArenaSettings()
     motion: MotionSettings = MotionSettings()
     sensor: SensorSettings = SensorSettings()
+    link: LinkSettings = LinkSettings()
     led: LedSettings = LedSettings()
     camera_optics: OpticsSettings = Field(default_factory=_camera_optics)
     """Where the camera hangs."""
@@ -201,19 +221,65 @@ class Settings(_Section):
 
     @model_validator(mode="after")
     def _devices_are_known(self) -> Self:
-        _device("robot", self.robot, {"virtual": False, "ble": True})
+        if not 1 <= len(self.robots) <= _MOST_ROBOTS:
+            raise ValueError(f"robot: list 1 to {_MOST_ROBOTS} robots, not {len(self.robots)}")
+        for robot in self.robots:
+            _device("robot", robot, {"virtual": False, "ble": True, "onboard": True})
         _device("camera", self.camera, {"virtual": False, "none": False, "usb": True, "file": True})
         _device("projector", self.projector, {"virtual": False, "display": True, "image": True})
-        if (self.robot == "virtual") != (self.projector == "virtual"):
-            raise ValueError("a virtual robot sees only the virtual projector: make both virtual, or neither")
-        if self.camera == "virtual" and self.robot != "virtual":
+        worlds = {robot in _VIRTUAL_ROBOTS for robot in self.robots}
+        if worlds != {self.projector == "virtual"}:
+            raise ValueError("a virtual robot sees only the virtual projector: make all virtual, or none")
+        if self.camera == "virtual" and not self.is_virtual:
             raise ValueError("a virtual camera sees only the virtual robot: set camera to usb:N, file:PATH or none")
         return self
+
+    @model_validator(mode="after")
+    def _robots_get_along(self) -> Self:
+        real = [robot for robot in self.robots if robot not in _VIRTUAL_ROBOTS]
+        if len(set(real)) < len(real):
+            raise ValueError("robot: one robot is listed twice; name each once")
+        if self.robots[0].startswith("onboard:") and (
+            self.arena.edge != "bump" or self.motion.turning is not Policy.LAMBERT
+        ):
+            raise ValueError(
+                "robot: one that estimates by itself knows bumps and lambert only; set edge and turning so"
+            )
+        if len(self.robots) > 1:
+            if any(robot.startswith("onboard:") for robot in self.robots):
+                raise ValueError("robot: a robot that estimates by itself rolls alone; list only one")
+            if self.camera != "none":
+                raise ValueError(
+                    "camera: several robots cannot be told apart on video yet; set it to none (--no-video)"
+                )
+            if self.motion.turning is not Policy.LAMBERT:
+                raise ValueError("motion.turning: robots that meet need lambert, whose lines a contact only shortens")
+        return self
+
+    @model_validator(mode="after")
+    def _policy_is_sound(self) -> Self:
+        try:
+            check_weighting(self.motion.turning, self.motion.weighting, disc=self.arena.kind == "disc")
+        except RequestError as error:
+            raise ValueError(f"motion.weighting: {error}") from error
+        return self
+
+    @property
+    def robots(self) -> tuple[str, ...]:
+        """The robots as a list, one or several."""
+        return (self.robot,) if isinstance(self.robot, str) else self.robot
 
     @property
     def is_virtual(self) -> bool:
         """Whether the session runs on the virtual bench, at virtual time."""
-        return self.robot == "virtual"
+        return self.robots[0] in _VIRTUAL_ROBOTS
+
+    def profile(self) -> RobotProfile:
+        """What the driver takes the robot for. Raises RequestError for a profile that cannot be read."""
+        profile = load_profile(self.robot_profile) if self.robot_profile is not None else RobotProfile()
+        if self.motion.cm_s_per_unit is not None:
+            profile = replace(profile, cm_s_per_unit=self.motion.cm_s_per_unit)
+        return profile
 
     def seeds(self) -> tuple[np.random.SeedSequence, np.random.SeedSequence, np.random.SeedSequence]:
         """Independent seeds of the virtual world, of the robot's turns, and of what the dictionary is learnt from."""
@@ -234,8 +300,10 @@ def _device(role: str, spec: str, kinds: dict[str, bool]) -> None:
         raise ValueError(f"{role} = {spec!r} is no device; use one of {forms}")
 
 
-def load_settings(path: Path | None, overrides: dict[str, Any] | None = None) -> Settings:
+def load_settings(path: Path | None, overrides: dict[str, Any] | None = None, *, simulate: bool = False) -> Settings:
     """Read a session's TOML (none: the defaults) and lay ``overrides`` (dotted keys) over it.
+
+    ``simulate`` puts a virtual device in the place of each real one.
 
     Raises:
         RequestError: the file cannot be read or a key is unknown or out of range; the line names it.
@@ -254,7 +322,18 @@ def load_settings(path: Path | None, overrides: dict[str, Any] | None = None) ->
         for parent in parents:
             section = section.setdefault(parent, {})
         section[key] = value
+    if simulate:
+        asked: Any = data.get("robot", "virtual")
+        robots = cast("list[Any]", asked) if isinstance(asked, list) else [asked]
+        data |= {"robot": [_simulated(robot) for robot in robots], "projector": "virtual"}
+        if data.get("camera") != "none":
+            data["camera"] = "virtual"
     return parse_settings(data, origin=str(path) if path else "settings")
+
+
+def _simulated(robot: object) -> str:
+    """The virtual robot that stands for a real one."""
+    return "onboard:virtual" if str(robot).startswith("onboard:") else "virtual"
 
 
 def parse_settings(data: dict[str, Any], *, origin: str) -> Settings:

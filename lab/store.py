@@ -20,7 +20,7 @@ import pandas as pd
 from lab.base.errors import ChordlabError, RequestError
 from lab.base.files import sync_folder, write_aside
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 MANIFEST = "manifest.json"
 EVENTS = "events.jsonl"
 LINES = "lines"
@@ -131,7 +131,7 @@ class SessionReader:
             raise SessionFolderError(folder, f"{MANIFEST} cannot be read: {error}") from error
         self.manifest: dict[str, Any] = cast("dict[str, Any]", manifest) if isinstance(manifest, dict) else {}
         version = self.manifest.get("schema_version")
-        if not isinstance(version, int):
+        if not isinstance(version, int) or version < 1:
             raise SessionFolderError(folder, f"{MANIFEST} has no schema_version")
         if version > SCHEMA_VERSION:
             raise SessionFolderError(
@@ -139,6 +139,7 @@ class SessionReader:
                 f"was written by a newer chordlab (schema {version}, this one reads up to {SCHEMA_VERSION}); "
                 "update chordlab",
             )
+        self.schema_version = version
 
     def events(self) -> Iterator[dict[str, Any]]:
         """The events in order. A torn last record is left out; a torn one before it is an error."""

@@ -15,6 +15,7 @@ from shapely.geometry.base import BaseGeometry
 
 from analysis.estimate import Estimate
 from analysis.figures.values import Band, Entry, Isotropy
+from analysis.runlengths import ArenaConsistency, ExpectedBias, RunLengths
 from lab.base.errors import RequestError
 
 _COLUMNS: Mapping[str, tuple[str, ...]] = {
@@ -27,6 +28,21 @@ _COLUMNS: Mapping[str, tuple[str, ...]] = {
     "chord_pairs": ("robot_length_cm", "true_length_cm"),
     "posteriors": ("n",),
 }
+
+
+@dataclass(frozen=True, slots=True)
+class RunCheck:
+    """The session's own runs against what isotropic lines predict.
+
+    Attributes:
+        lengths: The lengths of the runs from edge to edge.
+        consistency: The size by the known arena against Eq. 1; None with too few runs.
+        bias: What the turning that fits the runs does to A and P; None where the runs are as they should be.
+    """
+
+    lengths: RunLengths
+    consistency: ArenaConsistency | None
+    bias: ExpectedBias | None
 
 
 class ReportError(RequestError):
@@ -63,6 +79,7 @@ class SessionResult:
         chord_pairs: Chord by chord ``robot_length_cm`` and ``true_length_cm``.
         chords_missed: Chords that only the camera saw; ``chords_extra`` those that only the robot saw.
         isotropy: The tests of the runs' randomness.
+        runs_check: What the robot's own runs say of its turning.
         session: The session folder's name.
         provenance: Section -> what -> value: seed, settings, versions, devices, host figures.
         warnings: What the session wants the reader to know, a sentence each.
@@ -89,6 +106,7 @@ class SessionResult:
     chords_missed: int | None = None
     chords_extra: int | None = None
     isotropy: Isotropy | None = None
+    runs_check: RunCheck | None = None
     session: str = ""
     provenance: Mapping[str, Mapping[str, object]] = field(default_factory=dict[str, "Mapping[str, object]"])
     warnings: Sequence[str] = ()

@@ -98,6 +98,7 @@ def verdict_of(result: SessionResult) -> Verdict:
         *_sizes(result, measured),
         _camera(result, measured),
         _randomness(result),
+        *_turning(result),
     )
     problems = [*_of_the_recognition(result, measured), *_of_the_sizes(result, measured), *_of_the_runs(result)]
     if tone == "good" and problems:
@@ -193,6 +194,16 @@ def _randomness(result: SessionResult) -> Finding:
     return Finding("Randomness", f"{opening} Smallest p-value: {p_value(found.p_values[worst])} ({worst}).")
 
 
+def _turning(result: SessionResult) -> tuple[Finding, ...]:
+    check = result.runs_check
+    if check is None:
+        return ()
+    said = (
+        check.lengths.verdict if check.consistency is None else f"{check.lengths.verdict} {check.consistency.verdict}"
+    )
+    return (Finding("The robot's own runs", said),)
+
+
 def _of_the_recognition(result: SessionResult, measured: Estimate) -> list[Problem]:
     problems: list[Problem] = []
     if result.ranking and (result.ranking[0][0] != result.name or result.ranking[0][1] < result.stop_at):
@@ -286,14 +297,25 @@ def _of_the_chords(found: Agreement, missed: int, extra: int) -> list[Problem]:
 
 def _of_the_runs(result: SessionResult) -> list[Problem]:
     problems: list[Problem] = []
-    cut = int((result.lines["ended"] != "bump").sum())
+    short = result.lines["ended"].isin(["stall", "timeout", "link"])  # contacts are made good by weights
+    cut = int(short.sum())
     if result.runs and cut / result.runs > MISSED_TOLERANCE:
-        kinds = result.lines.loc[result.lines["ended"] != "bump", "ended"].value_counts()
+        kinds = result.lines.loc[short, "ended"].value_counts()
         listed = ", ".join(f"{number_of} by {kind}" for kind, number_of in kinds.items())
         problems.append(
             Problem(
                 f"{count(cut, 'run')} did not end at the wall ({listed}); cut runs lower A.",
                 "Charge the robot, clear the floor and stay in radio range, then repeat the session.",
+            )
+        )
+    check = result.runs_check
+    if check is not None and not check.lengths.passed:
+        expected = f" {check.bias.verdict}" if check.bias is not None else ""
+        problems.append(
+            Problem(
+                f"The runs are not those of isotropic lines (p-value {p_value(check.lengths.p_value)}).{expected}",
+                "Let it turn by Lambert's law at the edge (`motion.turning`), check that the bumps give the wall's "
+                "normal, and that [arena] is the arena that was rolled in.",
             )
         )
     if result.isotropy is not None and not result.isotropy.passed:

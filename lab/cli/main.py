@@ -10,7 +10,7 @@ import typer
 from typer.exceptions import TyperException
 
 from lab.base.errors import ChordlabError
-from lab.cli import batch, doctor, geometry, robot, run, shapes, track, validate
+from lab.cli import batch, calibrate, characterise, doctor, geometry, robot, run, shapes, track, validate
 from lab.cli.output import complain
 
 app = typer.Typer(
@@ -31,6 +31,8 @@ app.command("simulate")(geometry.simulate)
 app.command("doctor")(doctor.doctor)
 app.add_typer(shapes.app, name="shapes")
 app.add_typer(robot.app, name="robot")
+robot.app.command("characterise")(characterise.characterise)
+app.add_typer(calibrate.app, name="calibrate")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

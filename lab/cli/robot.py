@@ -8,20 +8,19 @@ from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict
 from itertools import pairwise
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
 
 from lab.base.errors import RequestError
-from lab.bench import SHAPE_MARGIN_CM
 from lab.cli.output import JsonFlag, emit, say, show_table
 from lab.clock import run
+from lab.pictures import check_on_floor, draw_pictures
 from lab.settings import load_settings
 from lab.world import virtual_world
 from projector.dictionary import shape_from
-from projector.render import render
-from projector.shape import check_fits
 from robot.bolt import Bolt, Heard, scan
 from robot.device import Sample
 from robot.profile import RobotProfile
@@ -129,6 +128,10 @@ def virtual(
     shape: Annotated[
         str | None, typer.Option(metavar="SHAPE", help="What is projected on its arena; none: a dark floor.")
     ] = None,
+    settings_file: Annotated[
+        Path | None,
+        typer.Option("--settings", metavar="SESSION.toml", help="Its arena, light, hidden profile and faults."),
+    ] = None,
     allow_remote: Annotated[
         bool, typer.Option("--allow-remote", help="Allow a HOST that other machines reach; HCI knows no password.")
     ] = False,
@@ -141,16 +144,21 @@ def virtual(
     host, port = parse_endpoint(hci)
     address = address_of(name)
     drawn = shape_from(shape) if shape is not None else None
-    settings = load_settings(None, {"camera": "none"})
+    settings = load_settings(settings_file, {"camera": "none"}, simulate=True)
+    if settings.robots[0].startswith("onboard:"):
+        raise RequestError(
+            f"{settings_file}: robot = {settings.robots[0]!r} is no BOLT; set it to virtual to serve one"
+        )
     if drawn is not None:
-        check_fits(drawn, settings.arena.polygon, SHAPE_MARGIN_CM)
+        check_on_floor(drawn, settings.arena)
 
     async def serve() -> None:
         seed = np.random.SeedSequence(settings.seed)
-        async with virtual_world(settings, seed, RobotProfile(), name=name) as world:
+        async with virtual_world(settings, seed, settings.profile(), name=name) as world:
             if drawn is not None:
                 optics = settings.projector_optics.pinhole()
-                world.projector.show(render(drawn.geometry, optics, settings.sensor.height_cm))
+                height_cm, size = settings.sensor.height_cm, optics.image_size
+                world.projector.show(draw_pictures(drawn.geometry, settings.arena, optics, height_cm, size).shape)
             # The first look at the light takes some 0.3 s to prepare; taken later, the stream would lack them.
             world.projector.light_at(np.zeros(1), np.zeros(1), settings.sensor.height_cm)
             server = HciServer(world.radio, host, port, anywhere=allow_remote)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -19,9 +19,9 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from lab.cli.output import JsonFlag, complain, emit, progress_bar, say
 from lab.experiment import Finished, run_experiment
 from lab.finalize import finalize
+from lab.ledger import Progress as Step
+from lab.ledger import Watcher
 from lab.review import review
-from lab.session import Progress as Step
-from lab.session import Watcher
 from lab.settings import Settings, load_settings
 from lab.store import write_checksums
 
@@ -29,6 +29,10 @@ from lab.store import write_checksums
 def run(
     session: Annotated[Path | None, typer.Argument(metavar="[SESSION.toml]", help="Settings; none: defaults.")] = None,
     simulate: Annotated[bool, typer.Option("--simulate", help="On the virtual bench, whatever the file says.")] = False,
+    robot: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ROBOT", help="ble:SB-1234, onboard:CL-1234 or virtual; once for each robot."),
+    ] = None,
     shape: Annotated[str | None, typer.Option(help="A dictionary name, text:WORD, or a shape file.")] = None,
     lines: Annotated[int | None, typer.Option(help="Stop after this many lines that cross the shape.")] = None,
     until: Annotated[float | None, typer.Option(help="Stop once the leading posterior reaches this.")] = None,
@@ -46,12 +50,12 @@ def run(
         session,
         simulate,
         no_video,
-        {"shape": shape, "stop.lines": lines, "stop.until": until, "seed": seed, "out": out},
+        {"robot": robot or None, "shape": shape, "stop.lines": lines, "stop.until": until, "seed": seed, "out": out},
     )
     hushed = quiet or as_json
     began_s = time.perf_counter()
-    with _session_bar(settings, quiet=hushed) as watch:
-        finished = run_experiment(settings, started=datetime.now(), watch=watch, say=_hush if hushed else complain)
+    with _session_bar(settings, quiet=hushed) as (watch, tell):
+        finished = run_experiment(settings, started=datetime.now(), watch=watch, say=tell)
     rolled_s = time.perf_counter() - began_s
     if finished.failure is not None:
         complain(f"chordlab: {finished.failure}")
@@ -79,19 +83,13 @@ def run(
         raise typer.Exit(1)
 
 
-def _hush(_text: str) -> None:
-    """Say nothing."""
-
-
 def _settings(session: Path | None, simulate: bool, no_video: bool, flags: dict[str, Any]) -> Settings:
     overrides = {
         key: str(value) if isinstance(value, Path) else value for key, value in flags.items() if value is not None
     }
-    if simulate:
-        overrides |= {"robot": "virtual", "projector": "virtual", "camera": "virtual"}
     if no_video:
         overrides["camera"] = "none"
-    return load_settings(session, overrides)
+    return load_settings(session, overrides, simulate=simulate)
 
 
 def _ratios(finished: Finished, settings: Settings, rolled_s: float) -> dict[str, float]:
@@ -119,8 +117,8 @@ def _peak_memory_mb() -> float:
 
 
 @contextmanager
-def _session_bar(settings: Settings, *, quiet: bool) -> Generator[Watcher]:
-    """Progress on stderr: lines, A ± , P ±, the leading name and its posterior, battery, time left."""
+def _session_bar(settings: Settings, *, quiet: bool) -> Generator[tuple[Watcher, Callable[[str], None]]]:
+    """Progress on stderr: lines, A ± , P ±, the leading name and its posterior, battery, time left; and what to say."""
     console = Console(stderr=True, quiet=quiet)
     columns = (
         TextColumn("line {task.completed}/{task.total}"),
@@ -148,7 +146,10 @@ def _session_bar(settings: Settings, *, quiet: bool) -> Generator[Watcher]:
                 told = tenth
                 complain(f"line {step.n}/{settings.stop.lines}  {text}")
 
-        yield watch
+        def tell(text: str) -> None:
+            console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+        yield watch, tell
 
 
 def _with_error(value: float, sigma: float) -> str:

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import shapely
 from numpy.testing import assert_allclose
 from scipy import stats
 from shapely import affinity
@@ -8,7 +9,7 @@ from shapely.geometry import box
 from analysis.montecarlo import Lines, simulate_crossings, simulate_lines
 from analysis.perline import LineModel, LineRecogniser, learn_tables, sensed_moments
 from analysis.quadrature import exact_moments
-from analysis.recognition import FIRST_POSTERIOR_N, GaussianRecogniser, Recogniser
+from analysis.recognition import FIRST_POSTERIOR_N, GaussianRecogniser, Recogniser, Weights
 from lab.base.errors import RequestError
 
 SIX = ("circle", "square", "triangle", "pyramid", "tower", "statue")
@@ -190,6 +191,108 @@ def test_priors_and_weights(moments, tables, six, rng):
         GaussianRecogniser(moments, prior={"circle": 1.0})
     with pytest.raises(RequestError, match="empty"):
         learn_tables({}, rng)
+
+
+def test_equal_weights_are_no_weights(moments, tables, six, rng):
+    k, l1, l3 = simulate_lines(six["tower"], 30, rng)
+    for c in (1e-3, 7.0):
+        for plain, weighted in zip(both(moments, tables), both(moments, tables), strict=True):
+            plain.update_many(k, l1, l3)
+            weighted.update_many(k, l1, l3, c)
+            assert weighted.posterior() == pytest.approx(plain.posterior())
+            one_by_one = type(plain)(moments if isinstance(plain, GaussianRecogniser) else tables)
+            for line in zip(k, l1, l3, strict=True):
+                one_by_one.update(*line, weight=c)
+            assert one_by_one.posterior() == pytest.approx(plain.posterior())
+            assert one_by_one.n == weighted.n == plain.n == 30
+
+
+def test_unequal_weights_count_as_kishs_number_of_lines(moments, tables, six, rng):
+    """(Σw)²/Σw² lines of the weighted mean, in both recognisers; by their formulas, from the lines."""
+    k, l1, l3 = simulate_lines(six["tower"], 40, rng)
+    w = rng.uniform(0.1, 3.0, 40)
+    kish = w.sum() ** 2 / (w**2).sum()
+    assert kish < 35
+    gaussian, lines = both(moments, tables)
+    for recogniser in (gaussian, lines):
+        recogniser.update_many(k, l1, l3, w)
+        recogniser.update(0, 0.0, 0.0, 50.0)  # one that met nothing is nothing, whatever it weighs
+        assert recogniser.n == 40
+    mean_k, mean_1, mean_3 = np.average(np.column_stack([k, l1, l3]), axis=0, weights=w)
+    area = np.pi / 3 * mean_3 / mean_1
+    at = gaussian.posterior_at(area, np.pi * area * mean_k / mean_1, kish)
+    assert gaussian.posterior() == pytest.approx(at)
+    log = kish * np.average(tables.look_up(k, l1, l3), axis=0, weights=w)
+    wanted = np.exp(log - log.max()) / np.exp(log - log.max()).sum()
+    assert list(lines.posterior().values()) == pytest.approx(wanted.tolist())
+    # and they tell less than as many lines of one weight
+    plain = LineRecogniser(tables)
+    plain.update_many(k, l1, l3)
+    assert Weights().effective_lines == 0
+    weights = Weights()
+    weights.take(w[:15])
+    for one in w[15:]:
+        weights.take(one)
+    assert weights.effective_lines == pytest.approx(kish)
+
+
+def test_a_reset_forgets_the_weights_too(moments, tables, six, rng):
+    k, l1, l3 = simulate_lines(six["tower"], 20, rng)
+    for recogniser in both(moments, tables):
+        recogniser.update_many(k, l1, l3, rng.uniform(1, 9, 20))
+        recogniser.reset()
+        recogniser.update_many(k, l1, l3)
+        fresh = type(recogniser)(moments if isinstance(recogniser, GaussianRecogniser) else tables)
+        fresh.update_many(k, l1, l3)
+        assert recogniser.posterior() == pytest.approx(fresh.posterior())
+
+
+def test_lines_drawn_by_their_length_are_put_right_by_their_weights(six, tables, moments):
+    """Lines through random points of the shape come with a density proportional to 𝓛_1, and weigh 1/𝓛_1."""
+    rng = np.random.default_rng(77)
+    right, claimed, size = {}, {}, {}
+    for how in ("weighted", "not"):
+        right[how], claimed[how], size[how] = 0, [], []
+    for name, geometry in six.items():
+        k, l1, l3 = lines_through(geometry, *random_lines(rng, 6000))
+        chance = np.maximum(l1, 1.0)  # so that no weight is beyond all measure
+        for _ in range(20):
+            drawn = rng.choice(len(k), 60, p=chance / chance.sum())
+            for how, weight in (("weighted", 1 / chance[drawn]), ("not", np.ones(60))):
+                recogniser = LineRecogniser(tables)
+                recogniser.update_many(k[drawn], l1[drawn], l3[drawn], weight)
+                right[how] += recogniser.ranked()[0][0] == name
+                claimed[how].append(recogniser.posterior()[name])
+                size[how].append(np.average(l3[drawn], weights=weight) / np.average(l1[drawn], weights=weight))
+                size[how][-1] *= np.pi / 3 / moments[name].area_cm2
+    assert right["weighted"] >= 0.95 * 120
+    assert right["not"] <= right["weighted"]
+    assert np.mean(claimed["not"]) < np.mean(claimed["weighted"])
+    assert np.mean(size["weighted"]) == pytest.approx(1, abs=0.05)
+    assert np.mean(size["not"]) > 1.2
+
+
+def random_lines(rng, n):
+    """Normal angle and distance of n lines over a disc that holds every shape of these tests."""
+    return rng.uniform(0, np.pi, n), rng.uniform(-60, 60, n)
+
+
+def lines_through(geometry, theta, p):
+    """(k, 𝓛_1, 𝓛_3) of those of given lines that cross, by shapely and by the definition: no code of the subject."""
+    along = np.stack([-np.sin(theta), np.cos(theta)], axis=1)
+    foot = p[:, None] * np.stack([np.cos(theta), np.sin(theta)], axis=1)
+    cuts = shapely.intersection(shapely.linestrings(np.stack([foot - 90 * along, foot + 90 * along], axis=1)), geometry)
+    found = []
+    for cut, step in zip(cuts, along, strict=True):
+        parts = [part for part in shapely.get_parts(cut) if part.length > 0]
+        s_cm = np.sort([shapely.get_coordinates(part) @ step for part in parts], axis=None)
+        sign = np.where(np.arange(s_cm.size) % 2 == 0, 1, -1)
+        apart = np.abs(s_cm[:, None] - s_cm)
+        unlike = -np.outer(sign, sign)
+        if parts:
+            found.append((len(parts), (unlike * apart).sum() / 2, (unlike * apart**3).sum() / 2))
+    k, l1, l3 = np.array(found).T
+    return k.astype(int), l1, l3
 
 
 def test_shapes_of_one_area_and_perimeter_differ_line_by_line(rng):

@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 from analysis.compare import deviation
 from analysis.figures.values import Entry, Isotropy, Measured
 from analysis.report import write
-from analysis.report.result import ReportError
+from analysis.report.result import ReportError, RunCheck
 from analysis.report.tables import provenance_of, tables_of
 from analysis.report.verdict import decided_at, lines_to_tell_apart, verdict_of
 from analysis.report.words import count, decimals_for, p_value, percent, plus_minus, probability, signed
 from analysis.report.write import ReportFileError, render_report, write_report
+from analysis.runlengths import arena_consistency, examine_runs, expected_bias
 from tests.analysis import sample_session as sample
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
@@ -364,6 +365,59 @@ def test_camera_is_compared_with_the_robot(result):
     assert tables_of(seen)[0].rows[0][-1] == "800 ± 10 cm²"
     assert "look random" in verdict_of(replace(result, isotropy=Isotropy(np.zeros(0), np.zeros(0)))).findings[-1].text
     assert "not tested" in verdict_of(replace(result, isotropy=None)).findings[-1].text
+
+
+# --- the robot's own runs ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def run_checks(result):
+    """Of the sample's runs as they are, and of a robot that rolls the shorter half of them."""
+    lengths = result.lines["length_cm"].to_numpy()
+    rng = np.random.default_rng(3)
+    sound = examine_runs(lengths, sample.ARENA, rng)
+    agrees = arena_consistency(*(result.lines[name] for name in ("k", "l1_cm", "l3_cm3")), lengths, sample.ARENA)
+    wrong = examine_runs(rng.permutation(np.sort(lengths)[:250]), sample.ARENA, rng)
+    bias = expected_bias(sample.TOWER, sample.ARENA, 0.0, rng, runs=40_000)
+    return RunCheck(sound, agrees, None), RunCheck(wrong, None, bias)
+
+
+def test_sound_runs_are_a_finding_and_no_problem(result, run_checks):
+    plain, checked = verdict_of(result), verdict_of(replace(result, runs_check=run_checks[0]))
+    assert (checked.problems, checked.tone) == (plain.problems, plain.tone)
+    (finding,) = set(checked.findings) - set(plain.findings)
+    assert "No fault found" in finding.text
+    assert f"{math.pi * 120 * 90 / (2 * (120 + 90)):.1f} cm are expected" in finding.text
+    assert "The arena and Eq. 1 agree" in finding.text
+
+
+def test_runs_that_are_none_of_isotropic_lines_are_a_problem_with_the_bias_they_make(result, run_checks):
+    clean, wrong = replace(result, chords_missed=0), run_checks[1]
+    verdict = verdict_of(replace(clean, runs_check=wrong))
+    assert (verdict_of(clean).tone, verdict.tone) == ("good", "fair")
+    (problem,) = verdict.problems
+    assert "not those of isotropic lines (p" in problem.what
+    area, perimeter = (float(found) for found in re.findall(r"by ([+-][\d.]+) ± [\d.]+ %", problem.what))
+    assert [area, perimeter] == pytest.approx([100 * wrong.bias.area_rel, 100 * wrong.bias.perimeter_rel], abs=0.06)
+    assert area < -3
+    assert "Lambert" in problem.next_step
+    assert "bias this shape" not in verdict_of(replace(clean, runs_check=replace(wrong, bias=None))).problems[0].what
+
+
+def test_the_page_shows_what_the_runs_say(result, run_checks, page):
+    for check in run_checks:
+        words = Page(render_report(replace(result, runs_check=check))).words
+        assert check.lengths.verdict.split(":")[0] in words
+        assert "own runs" in words
+    assert "own runs" not in Page(page).words
+
+
+@pytest.mark.parametrize(("ended", "told"), [("stall", True), ("link", True), ("timeout", True), ("contact", False)])
+def test_runs_that_were_cut_are_told_but_for_contacts_which_weights_make_good(result, ended, told):
+    lines = result.lines.copy()
+    lines.loc[:29, "ended"] = ended
+    said = " ".join(problem.what for problem in verdict_of(replace(result, lines=lines)).problems)
+    assert (f"30 runs did not end at the wall (30 by {ended})" in said) is told
 
 
 # --- words ------------------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from lab.experiment import Finished, run_experiment
-from lab.session import Progress
+from lab.ledger import Progress
 from lab.settings import load_settings
 
 STARTED = datetime(2026, 11, 23, 10, 42)
@@ -40,3 +40,9 @@ def square_session(tmp_path_factory) -> Rolled:
 def filmed_session(tmp_path_factory) -> Rolled:
     """A dozen lines over the square, filmed."""
     return roll(tmp_path_factory.mktemp("filmed"), shape="square", camera="virtual", stop__lines=12, seed=2)
+
+
+@pytest.fixture(scope="session")
+def uniform_session(tmp_path_factory) -> Rolled:
+    """100 lines over the tower by a robot that turns by a uniform angle, as it should not; no video."""
+    return roll(tmp_path_factory.mktemp("uniform"), motion__turning="uniform", stop__lines=100, seed=5)

@@ -130,7 +130,21 @@ def test_virtual_is_found_asked_and_driven_from_another_process(capsys) -> None:
         assert "no HCI server at" in complaint(capsys, 1, "robot", "scan", *there)
 
 
-def test_bad_requests_are_one_line(capsys) -> None:
+def test_virtual_serves_the_arena_of_a_settings_file_its_ring_of_light_too(capsys, tmp_path) -> None:
+    file = tmp_path / "s.toml"
+    file.write_text('robot = "ble:SB-0001"\nprojector = "display:1"\nseed = 4\n[arena]\nedge = "dark_ring"\n')
+    with serving("--name", "SB-1A2B", "--shape", "circle", "--settings", str(file)) as (_, served):
+        drive = ("robot", "drive", "SB-1A2B", "--speed", "5", "--seconds", "0.5", "--hci", served["hci"])
+        found = answer(capsys, *drive)
+    # Where light marks the edge the floor itself has 0.4 of the projector's light; dark it has some 20 lux, lit 120.
+    assert found["mean_light_lux"] == pytest.approx(60, abs=3)
+
+
+def test_bad_requests_are_one_line(capsys, tmp_path) -> None:
+    alone = tmp_path / "alone.toml"
+    alone.write_text('robot = "onboard:virtual"\n')
+    assert "is no BOLT" in complaint(capsys, 2, "robot", "virtual", "--settings", str(alone))
+    assert "No such file" in complaint(capsys, 2, "robot", "virtual", "--settings", str(tmp_path / "none.toml"))
     for wrong in ("here", "127.0.0.1:99999", "127.0.0.1:x"):
         assert "is no HOST:PORT" in complaint(capsys, 2, "robot", "virtual", "--hci", wrong)
         assert "is no HOST:PORT" in complaint(capsys, 2, "robot", "scan", "--hci", wrong)

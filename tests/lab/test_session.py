@@ -13,7 +13,6 @@ from lab.base.errors import ChordlabError, RequestError
 from lab.experiment import run_experiment
 from lab.finalize import finalize, tables_of
 from lab.review import recognised, review
-from lab.session import SessionError
 from lab.settings import load_settings
 from lab.store import SessionReader
 from robot.crossings import Levels, LevelsError, crossings_of
@@ -42,6 +41,7 @@ def test_the_log_tells_the_whole_session(square_session):
     assert [event["line"] for event in events if event["event"] == "line"] == list(range(len(events) - 2))
     assert session.manifest["end"]["state"] == "complete"
     assert session.manifest["devices"]["robot"]["name"] == "SB-7E57"
+    assert session.manifest["devices"]["robots"][0]["levels"]["edge"] is None
     assert session.manifest["shape"]["name"] == "square"
     assert 18 < session.manifest["levels"]["dark_lux"] < 22
     assert 118 < session.manifest["levels"]["bright_lux"] < 122
@@ -154,11 +154,8 @@ def test_a_robot_that_sets_off_into_the_wall_draws_again(tmp_path, monkeypatch):
     assert (stalled["t_end_s"] - stalled["t_start_s"]).max() < 4
 
 
-def test_the_uniform_turn_is_the_biased_one(tmp_path):
-    lambert, uniform = (
-        tables_of(SessionReader(roll(tmp_path / turning, motion__turning=turning, stop__lines=150).folder)).lines
-        for turning in ("lambert", "uniform")
-    )
+def test_the_uniform_turn_is_the_biased_one(square_session, uniform_session):
+    lambert, uniform = (tables_of(SessionReader(session.folder)).lines for session in (square_session, uniform_session))
     assert uniform["length_cm"].iloc[1:].mean() < lambert["length_cm"].iloc[1:].mean() - 5
 
 
@@ -211,7 +208,7 @@ def test_a_full_disk_stops_the_session_and_what_was_written_reads(tmp_path, monk
     assert tables_of(SessionReader(folder)).lines["line"].tolist() == [0, 1, 2, 3]
 
 
-def test_a_link_that_breaks_ends_the_session_in_one_line(tmp_path, monkeypatch):
+def test_a_link_that_breaks_costs_the_line_in_progress_alone(tmp_path, monkeypatch):
     from robot.virtual.bolt import VirtualBolt
 
     started = VirtualBolt.start
@@ -222,26 +219,21 @@ def test_a_link_that_breaks_ends_the_session_in_one_line(tmp_path, monkeypatch):
         await started(self)
 
     monkeypatch.setattr(VirtualBolt, "start", note)
-    settings = load_settings(None, {"out": str(tmp_path), "camera": "none", "stop.lines": 100})
+    settings = load_settings(None, {"out": str(tmp_path), "camera": "none", "shape": "square", "stop.lines": 8})
     finished = run_experiment(
         settings, started=STARTED, watch=lambda step: twins[0].drop_link() if step.line == 3 else None
     )
-    assert isinstance(finished.failure, ChordlabError)
-    assert "\n" not in str(finished.failure)
+    assert finished.failure is None
     session = SessionReader(finished.folder)
-    assert session.manifest["end"]["state"] == "failed"
-    assert tables_of(session).lines["line"].tolist()[:4] == [0, 1, 2, 3]
-
-
-def test_an_empty_battery_ends_the_session(tmp_path, monkeypatch):
-    from robot.virtual.body import Body
-
-    monkeypatch.setattr(Body, "battery_v", property(lambda body: 3.9 if body.distance_cm < 2500 else 3.4))
-    settings = load_settings(None, {"out": str(tmp_path), "camera": "none", "stop.lines": 1000})
-    finished = run_experiment(settings, started=STARTED)
-    assert isinstance(finished.failure, SessionError)
-    assert "3.40 V" in str(finished.failure)
-    assert len(tables_of(SessionReader(finished.folder)).lines) > 20
+    assert session.manifest["end"]["state"] == "complete"
+    tables = tables_of(session)
+    assert tables.lines["line"].tolist() == list(range(len(tables.lines)))
+    # it broke between two runs or at the next one's first command: whatever had ended before is whole
+    assert tables.lines["ended"].iloc[:4].tolist() == ["bump"] * 4
+    assert (tables.lines["ended"] == "link").sum() <= 1
+    assert not tables.lines.loc[tables.lines["ended"] == "link", "counts"].any()
+    assert [event["event"] for event in session.events() if event["event"] in ("lost", "back")] == ["lost", "back"]
+    assert tables.estimates["n"].tolist() == list(range(1, 9))
 
 
 def test_the_robot_stands_still_after_every_way_out(tmp_path, monkeypatch):

@@ -37,6 +37,17 @@ def test_a_file_is_read_and_flags_lie_over_it(tmp_path):
         ("robot = 'ble:SB-1234'\nprojector = 'display:1'", "virtual camera"),
         ("lines = [", "is not TOML"),
         ("seed = -1", "seed"),
+        ("robot = []", "list 1 to 8 robots"),
+        ("robot = ['virtual', 'ble:SB-1234']", "make all virtual"),
+        ("robot = ['virtual', 'virtual']", "--no-video"),
+        ("camera = 'none'\nrobot = ['virtual', 'virtual']\n[motion]\nturning = 'interior'", "need lambert"),
+        ("[motion]\nturning = 'uniform'\nweighting = 'run_length'", "disc arena alone"),
+        ("[motion]\nturning = 'spiral'", "motion.turning"),
+        ("[motion]\nweighting = 'run_length'", "would bias"),
+        ("[arena]\nring_cm = 0", "arena.ring_cm"),
+        ("[link]\nreconnect_s = -1", "link.reconnect_s"),
+        ("[[virtual.faults]]\nkind = 'flood'\nat_s = 3", "virtual.faults.0.kind"),
+        ("[[virtual.faults]]\nkind = 'stall'", "virtual.faults.0.at_s"),
     ],
 )
 def test_a_fault_is_one_line_that_names_it(tmp_path, text, says):
@@ -55,6 +66,51 @@ def test_a_missing_file_and_one_that_is_no_text(tmp_path):
     (tmp_path / "x.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(RequestError, match="not TOML"):
         load_settings(tmp_path / "x.toml")
+
+
+def test_the_lines_lie_a_balls_radius_inside_the_walls_or_within_the_ring():
+    rectangle, disc = {"width_cm": 100.0, "height_cm": 80.0}, {"kind": "disc", "radius_cm": 50.0}
+    for edge, off_cm in (("bump", BALL_RADIUS_CM), ("dark_ring", 6.0), ("bright_ring", 6.0)):
+        found = parse_settings({"arena": {**rectangle, "edge": edge, "ring_cm": 6.0}}, origin="t").arena
+        half_w, half_h = 50 - off_cm, 40 - off_cm
+        assert found.lines_within.bounds == pytest.approx((-half_w, -half_h, half_w, half_h))
+        assert found.longest_line_cm == pytest.approx(2 * math.hypot(half_w, half_h))
+        round_one = parse_settings({"arena": {**disc, "edge": edge, "ring_cm": 6.0}}, origin="t").arena
+        assert round_one.lines_within.area == pytest.approx(math.pi * (50 - off_cm) ** 2, rel=1e-3)
+        assert round_one.longest_line_cm == pytest.approx(2 * (50 - off_cm), rel=1e-4)
+        assert found.reachable.bounds[2] == pytest.approx(50 - BALL_RADIUS_CM)
+        if edge == "bump":
+            assert found.ring is None
+        else:
+            assert found.ring.area == pytest.approx(100 * 80 - 88 * 68)
+            assert round_one.ring.area == pytest.approx(math.pi * (50**2 - 44**2), rel=1e-3)
+
+
+def test_a_ring_wider_than_the_arena_is_refused():
+    settings = parse_settings({"arena": {"edge": "dark_ring", "ring_cm": 46.0}}, origin="t")
+    with pytest.raises(RequestError, match="ring of 46 cm"):
+        _ = settings.arena.lines_within
+
+
+def test_simulate_puts_a_virtual_robot_in_the_place_of_each_real_one():
+    real = {"projector": "display:1", "camera": "none"}
+    several = load_settings(None, {**real, "robot": ["ble:SB-0001", "ble:SB-0002"]}, simulate=True)
+    assert several.robots == ("virtual", "virtual")
+    assert several.is_virtual
+    alone = load_settings(None, {**real, "robot": "onboard:CL-0001"}, simulate=True)
+    assert alone.robots == ("onboard:virtual",)
+    assert load_settings(None, {**real, "robot": "ble:SB-0001", "camera": "usb:0"}, simulate=True).camera == "virtual"
+
+
+def test_the_profile_is_read_and_the_settings_speed_lies_over_it(tmp_path):
+    assert load_settings(None).profile().cm_s_per_unit == 0.59
+    file = tmp_path / "p.toml"
+    file.write_text("cm_s_per_unit = 0.7\nleast_speed_units = 9\n")
+    assert load_settings(None, {"robot_profile": str(file)}).profile().cm_s_per_unit == 0.7
+    profile = load_settings(None, {"robot_profile": str(file), "motion.cm_s_per_unit": 0.8}).profile()
+    assert (profile.cm_s_per_unit, profile.least_speed_units) == (0.8, 9)
+    with pytest.raises(RequestError, match=r"none.toml"):
+        load_settings(None, {"robot_profile": str(tmp_path / "none.toml")}).profile()
 
 
 def test_an_arena_too_small_for_the_ball_is_refused():
@@ -77,8 +133,14 @@ def test_every_setting_is_documented():
 
 
 def test_what_the_manifest_holds_reads_back_to_the_same_settings():
-    settings = load_settings(None, {"arena.kind": "disc", "stop.until": 0.95})
-    assert parse_settings(settings.model_dump(mode="json"), origin="manifest") == settings
+    faults = [{"kind": "stall", "at_s": 3.0}]
+    for keys in (
+        {"arena.kind": "disc", "stop.until": 0.95},
+        {"robot": ["virtual", "virtual"], "camera": "none", "virtual.faults": faults},
+        {"robot": "onboard:virtual"},
+    ):
+        settings = load_settings(None, keys)
+        assert parse_settings(settings.model_dump(mode="json"), origin="manifest") == settings
 
 
 @given(

@@ -19,9 +19,9 @@ def writer(tmp_path, **manifest):
 
 def line_event(line, **changes):
     event = {
-        "line": line, "t_start_s": 1.0 * line, "t_rolling_s": line + 0.05, "t_end_s": line + 0.5,
-        "length_cm": 50.0, "speed_cm_s": 25.0,
-        "ended": "bump", "counts": True, "k": 1, "l1_cm": 10.0, "l3_cm3": 1000.0,
+        "line": line, "robot": "SB-7E57", "t_start_s": 1.0 * line, "t_rolling_s": line + 0.05, "t_end_s": line + 0.5,
+        "length_cm": 50.0, "end_cm": 49.0, "speed_cm_s": 25.0, "starts_lit": False, "ends_lit": False,
+        "ended": "bump", "counts": True, "whole": True, "weight": 1.0, "k": 1, "l1_cm": 10.0, "l3_cm3": 1000.0,
         "crossings": [[line + 0.1, 5.0, True], [line + 0.3, 15.0, False]],
     }  # fmt: skip
     return event | changes
@@ -146,6 +146,26 @@ def test_a_changed_log_is_named_not_read_over(tmp_path, record):
     (made.folder / "events.jsonl").write_text(record + "\n")
     with pytest.raises(SessionFolderError):
         tables_of(SessionReader(made.folder))
+
+
+def test_a_log_of_the_first_schema_reads_as_one_robot_rolling_whole_lines(tmp_path):
+    made = writer(tmp_path)
+    new = ("robot", "end_cm", "starts_lit", "ends_lit", "whole", "weight")
+    for line in (0, 1):
+        old = line_event(line, counts=line > 0)
+        made.append("line", **{name: value for name, value in old.items() if name not in new})
+    made.close()
+    manifest = made.folder / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"schema_version": 2', '"schema_version": 1'))
+    lines = finalize(made.folder).lines
+    assert lines["whole"].tolist() == lines["counts"].tolist() == [False, True]
+    assert lines["weight"].tolist() == [1.0, 1.0]
+    assert lines["end_cm"].tolist() == lines["length_cm"].tolist()
+    assert lines["robot"].nunique() == 1
+    # what a log of today lacks is no matter of age
+    manifest.write_text(manifest.read_text().replace('"schema_version": 1', '"schema_version": 2'))
+    with pytest.raises(SessionFolderError, match="not whole"):
+        finalize(made.folder)
 
 
 def test_a_value_of_the_wrong_kind_is_named(tmp_path):
