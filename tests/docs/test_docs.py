@@ -1,14 +1,18 @@
-"""The documents: links that lead somewhere, commands that exist, settings that are read."""
+"""The documents: links that lead somewhere, commands that exist, settings that are read, messages that are said."""
 
 import re
 import shlex
+import tomllib
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
 from typer.main import get_command
 
 from lab.cli.main import app
+from lab.finalize import CROSSING_COLUMNS, ESTIMATE_COLUMNS, LINE_COLUMNS
 from lab.settings import load_settings
+from robot.profile import RobotProfile, load_profile
 
 HOME = Path(__file__).parents[2]
 PAGES = sorted([HOME / "README.md", HOME / "CHANGELOG.md", *(HOME / "docs").rglob("*.md")])
@@ -26,10 +30,18 @@ def commands_of(page: Path) -> list[str]:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_relative_links_lead_somewhere(page):
-    links = re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8"))
-    for link in links:
+    links = re.findall(r"\]\(([^)#\s]*)(#[^)\s]+)?\)", page.read_text(encoding="utf-8"))
+    for link, place in links:
         if "://" not in link:
-            assert (page.parent / link).exists(), link
+            target = page.parent / link if link else page
+            assert target.exists(), link
+            assert not place or place[1:] in anchors_of(target), place
+
+
+def anchors_of(page: Path) -> set[str]:
+    """The anchors that forges make of a page's headings."""
+    headings = re.findall(r"^#+ (.+)$", FENCE.sub("", page.read_text(encoding="utf-8")), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
 @pytest.mark.parametrize(
@@ -55,7 +67,10 @@ def test_every_toml_shown_is_read(page, tmp_path):
         if language == "toml":
             file = tmp_path / f"{number}.toml"
             file.write_text(block, encoding="utf-8")
-            assert load_settings(file).robot
+            if block.startswith("# robot-profile.toml"):
+                assert load_profile(file) != RobotProfile()
+            else:
+                assert load_settings(file).robot
 
 
 def test_every_module_of_the_lab_is_in_the_architecture():
@@ -65,3 +80,32 @@ def test_every_module_of_the_lab_is_in_the_architecture():
             assert f"`{module.stem}`" in text, module.stem
     for room in ("robot", "projector", "tracking", "analysis"):
         assert f"| `{room}` |" in text
+
+
+def test_every_key_of_a_robot_profile_is_in_the_guide_with_its_default():
+    text = (HOME / "docs/robots.md").read_text(encoding="utf-8")
+    rows = [row.split(" | ") for row in text.splitlines() if row.startswith("| `")]
+    defaults = {key: row[2] for row in rows if len(row) == 5 for key in re.findall(r"`(\w+)`", row[0])}
+    for field in fields(RobotProfile):
+        told = defaults[field.name].strip("`")
+        default = list(field.default) if isinstance(field.default, tuple) else field.default
+        assert (None if told == "–" else tomllib.loads(f"value = {told}")["value"]) == default, field.name
+
+
+def test_every_column_is_in_the_session_folders_page():
+    text = (HOME / "docs/session-folder.md").read_text(encoding="utf-8")
+    for column in (*LINE_COLUMNS, *CROSSING_COLUMNS, *ESTIMATE_COLUMNS):
+        assert f"`{column}`" in text, column
+
+
+def test_the_messages_that_the_guide_explains_are_said():
+    """As the code has them, with … for what is filled in."""
+    text = (HOME / "docs/robots.md").read_text(encoding="utf-8")
+    table = text[text.index("## Troubleshooting") :]
+    shown = [row.split("|")[1].strip() for row in table.splitlines() if row.startswith("| `")]
+    sources = [path.read_text(encoding="utf-8") for room in ("robot", "lab") for path in (HOME / room).rglob("*.py")]
+    code = re.sub(r"[\"']\s*\n\s*f?[\"']", "", "\n".join(sources))
+    said = re.sub(r"\{[^{}]*\}", "…", code)
+    assert len(shown) > 20
+    for message in shown:
+        assert message.split("`")[1] in said, message
