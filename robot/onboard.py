@@ -43,8 +43,8 @@ class Precision:
     __slots__ = ()
 
     def covariance(self) -> tuple[float, float, float]:
-        """Variance of A (cm^4), covariance of A and P (cm^3), variance of P (cm^2)."""
-        raise NotImplementedError
+        """Variance of A (cm^4), covariance of A and P (cm^3), variance of P (cm^2); NaN where none is kept."""
+        return _NAN, _NAN, _NAN
 
     def sigma_area(self) -> float:
         """Standard error of ``area()`` in cm^2; NaN before the second line."""
