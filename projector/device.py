@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import time
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -35,6 +37,11 @@ class ProjectorDevice(Protocol):
         """(width, height) in pixels."""
         ...
 
+    @property
+    def shown_s(self) -> float | None:
+        """When the image now shown was put out, by ``now_s``; None before the first."""
+        ...
+
     def show(self, image: NDArray[np.uint8]) -> None:
         """Show ``image``; raises ProjectorRequestError for another size or type."""
         ...
@@ -42,6 +49,17 @@ class ProjectorDevice(Protocol):
     def close(self) -> None:
         """Let go of the device."""
         ...
+
+
+def now_s() -> float:
+    """Seconds on the running event loop's clock, virtual time too; without a loop the monotonic clock's.
+
+    The loop of a real session reads that same monotonic clock, so both agree.
+    """
+    try:
+        return asyncio.get_running_loop().time()
+    except RuntimeError:
+        return time.monotonic()
 
 
 def check_image(image: NDArray[np.uint8], image_size: tuple[int, int], device: str) -> None:

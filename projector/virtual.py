@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lab.base.errors import RequestError
 from lab.base.pinhole import Pinhole
-from projector.device import check_image
+from projector.device import check_image, now_s
 from projector.kernels import sample_plane
 from projector.render import GAMMA, code_to_light
 
@@ -64,6 +64,7 @@ class VirtualProjector:
         self.pinhole = pinhole
         self.settings = settings or LightSettings()
         self.shows = 0
+        self._shown_s: float | None = None
         self._homographies: dict[float, Floats] = {}
         self._distorted = bool(np.any(pinhole.distortion != 0))
         width, height = pinhole.image_size
@@ -75,12 +76,18 @@ class VirtualProjector:
         """(width, height) in pixels."""
         return self.pinhole.image_size
 
+    @property
+    def shown_s(self) -> float | None:
+        """When the image now shown was put out, on the event loop's clock; None before the first."""
+        return self._shown_s
+
     def show(self, image: NDArray[np.uint8]) -> None:
         """Show ``image``, uint8 (height, width). Raises ProjectorRequestError for another size or type."""
         check_image(image, self.image_size, "virtual")
         self.image = image.copy()
         self._lux = self._to_lux(self.image)
         self.shows += 1
+        self._shown_s = now_s()
 
     def close(self) -> None:
         """Nothing to let go of."""
