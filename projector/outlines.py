@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from fontTools.pens.basePen import BasePen
 from fontTools.ttLib import TTFont, TTLibError
-from matplotlib.font_manager import FontProperties, findfont
+from matplotlib.font_manager import FontProperties, findfont, findSystemFonts, fontManager, get_font
 from numpy.typing import NDArray
 
 from projector.shape import ShapeError
@@ -26,15 +26,28 @@ Point = tuple[float, float]
 
 CURVE_POINTS = 32
 _SHARE: Floats = np.arange(1, CURVE_POINTS + 1) / CURVE_POINTS
+_UPRIGHT = ("Regular", "Book", "Roman", "Normal")
 _FULL_NAME = 4  # the name table's id for "family and style"
 
 
 def installed_font(family: str) -> Path | None:
-    """The file of a font family that matplotlib's font manager finds on this system, or None."""
+    """The file of a font family that matplotlib's font manager finds on this system, or None.
+
+    The manager keeps a list between runs and misses what was installed since; those files are looked at too.
+    """
     try:
         return Path(str(findfont(FontProperties(family=[family]), fallback_to_default=False)))
     except ValueError:
-        return None
+        pass
+    listed = {entry.fname for entry in fontManager.ttflist}
+    for path in sorted(set(findSystemFonts()) - listed):
+        try:
+            face = get_font(path)
+        except (OSError, RuntimeError):  # no font after all
+            continue
+        if face.family_name == family and face.style_name in _UPRIGHT:
+            return Path(path)
+    return None
 
 
 class _FlatPen(BasePen):

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from shapely.affinity import scale, translate
-from shapely.geometry import MultiPolygon, Polygon
+from shapely.affinity import scale as enlarge
+from shapely.affinity import translate
+from shapely.geometry import LinearRing, MultiPolygon, Polygon
 from shapely.validation import explain_validity
 
 from lab.base.errors import RequestError
@@ -22,6 +24,10 @@ DIGEST_STEP_CM = 1e-4  # a micrometre: far below what a projector draws, far abo
 MAX_POINTS = 200_000  # of one silhouette: far above any drawing, and still quick to intersect
 FIT_WIDTH_CM = 100.0
 FIT_HEIGHT_CM = 70.0
+MAX_COORDINATE = 1e9  # of a file, in its unit: ten thousand kilometres of cm
+SMALLEST_CM = 1.0  # of the longer side: a robot that reads every centimetre or two meets nothing smaller
+THINNEST = 1e-5  # cm of area per perimeter: such slivers are drawn by rounding alone
+LARGEST_CM = 1000.0  # no floor under a projector is larger
 _AGREEMENT_CM = 1e-9  # slack for the rounding of a boundary that touches another
 
 
@@ -35,6 +41,24 @@ class ShapeError(RequestError):
         self.subject = subject
         # a text or a file's name may hold line breaks; a message is one line
         super().__init__(" ".join(f"{subject}: {problem}".splitlines()))
+
+
+@dataclass(frozen=True, slots=True)
+class Drawing:
+    """What a file draws, before it has a name.
+
+    ``size_from`` says where its size comes from; then ``geometry`` is in cm. It is empty where the file states none,
+    and ``geometry`` in the file's own unit. ``notes`` say in a line each what was done that its author should know.
+    """
+
+    geometry: Silhouette
+    size_from: str = ""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def in_cm(self) -> bool:
+        """Whether the file says its size."""
+        return bool(self.size_from)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +134,12 @@ def polygons_of(geometry: Silhouette) -> list[Polygon]:
     return [geometry] if isinstance(geometry, Polygon) else list(geometry.geoms)
 
 
+def rings_of(geometries: Iterable[Silhouette]) -> list[LinearRing]:
+    """All rings of some silhouettes, outer ones and holes."""
+    pieces = [piece for geometry in geometries for piece in polygons_of(geometry)]
+    return [ring for piece in pieces for ring in (piece.exterior, *piece.interiors)]
+
+
 def count_points(geometry: Silhouette) -> int:
     """How many vertices a silhouette has."""
     return len(shapely.get_coordinates(geometry))
@@ -129,8 +159,12 @@ def check_silhouette(geometry: Silhouette, subject: str) -> None:
         raise ShapeError(subject, "a coordinate is not a finite number; every vertex needs finite x and y")
     if not geometry.is_valid:
         reason = " ".join(explain_validity(geometry).split())
-        raise ShapeError(subject, f"the outline crosses or touches itself ({reason}); untangle it there")
-    if geometry.area <= 0:
+        raise ShapeError(
+            subject,
+            f"the outline crosses or touches itself ({reason}); untangle it there, or mend it by"
+            " chordlab shapes import --mend",
+        )
+    if not 0 < geometry.area < np.inf:
         raise ShapeError(subject, "the shape has no area; draw an outline that encloses some")
 
 
@@ -140,26 +174,68 @@ def fit(
     *,
     width_cm: float | None = None,
     height_cm: float | None = None,
+    area_cm2: float | None = None,
+    scale: float | None = None,
     keep_size: bool = False,
 ) -> Silhouette:
     """Scale a silhouette, proportions kept, and centre its bounding box on the arena's origin.
 
     Given one of ``width_cm`` and ``height_cm`` the box gets that side; given both it is made as large as
-    both allow. Given neither, ``keep_size`` leaves a silhouette that is in cm already, otherwise it is
-    made as large as 100 cm in width and 70 cm in height allow (inside the default arena of 120 x 90 cm).
-    Raises ShapeError for a size that is not above 0.
+    both allow. ``area_cm2`` gives it that area, ``scale`` multiplies its lengths. Given none of them,
+    ``keep_size`` leaves a silhouette that is in cm already, otherwise it is made as large as 100 cm in width
+    and 70 cm in height allow (inside the default arena of 120 x 90 cm). Raises ShapeError for a size that is
+    not above 0, or sizes that contradict each other.
     """
-    for name, value in (("width", width_cm), ("height", height_cm)):
+    given = {"width": width_cm, "height": height_cm, "area": area_cm2, "scale": scale}
+    for name, value in given.items():
         if value is not None and not (np.isfinite(value) and value > 0):
-            raise ShapeError(subject, f"the {name} must be above 0 cm, got {value:g}")
+            unit = {"area": " cm²", "scale": ""}.get(name, " cm")
+            raise ShapeError(subject, f"the {name} must be above 0{unit}, got {value:g}")
+    chosen = [name for name, value in given.items() if value is not None]
+    if len(chosen) > 1 and chosen != ["width", "height"]:
+        raise ShapeError(subject, f"{' and '.join(chosen)} contradict each other; give one of them")
+    x_low, y_low, x_high, y_high = geometry.bounds
     width, height = size_of(geometry)
-    if width_cm is None and height_cm is None:
-        factor = 1.0 if keep_size else min(FIT_WIDTH_CM / width, FIT_HEIGHT_CM / height)
-    else:
+    # centred first: map coordinates lie far off, and would lose digits
+    centred = translate(geometry, -(x_low + x_high) / 2, -(y_low + y_high) / 2)
+    if scale is not None:
+        factor = scale
+    elif area_cm2 is not None:
+        factor = float(np.sqrt(area_cm2 / centred.area))
+    elif chosen:
         factor = min((width_cm or np.inf) / width, (height_cm or np.inf) / height)
-    scaled = scale(geometry, factor, factor, origin=(0.0, 0.0))
-    x_low, y_low, x_high, y_high = scaled.bounds
-    return translate(scaled, -(x_low + x_high) / 2, -(y_low + y_high) / 2)
+    else:
+        factor = 1.0 if keep_size else min(FIT_WIDTH_CM / width, FIT_HEIGHT_CM / height)
+    scaled = enlarge(centred, factor, factor, origin=(0.0, 0.0))
+    return unrounded(scaled, subject) if geometry.is_valid else scaled
+
+
+def unrounded(geometry: Silhouette, subject: str) -> Silhouette:
+    """Part edges again that rounding has laid on each other, in a silhouette that was valid before it was scaled."""
+    if geometry.is_valid:
+        return geometry
+    parted = geometry.buffer(0)
+    _check_thickness(parted, subject)
+    return parted
+
+
+def check_sane(geometry: Silhouette, subject: str) -> None:
+    """Raise ShapeError for a size that is hardly meant: drawn in metres, degrees or micrometres, say."""
+    _check_thickness(geometry, subject)
+    width, height = size_of(geometry)
+    if SMALLEST_CM <= max(width, height) <= LARGEST_CM:
+        return
+    problem = "too small for a robot to meet" if max(width, height) < SMALLEST_CM else "larger than any arena"
+    raise ShapeError(
+        subject,
+        f"is {width:.3g} x {height:.3g} cm, {problem}; give its true size by chordlab shapes import with --width,"
+        " --height, --area or --scale",
+    )
+
+
+def _check_thickness(geometry: Silhouette, subject: str) -> None:
+    if geometry.area <= THINNEST * geometry.length:  # nothing left at all counts too
+        raise ShapeError(subject, "is so thin that it encloses next to nothing; draw it thicker")
 
 
 def check_fits(shape: Shape, arena: Polygon, margin_cm: float = 0.0) -> None:

@@ -27,11 +27,15 @@ _WHITE = re.compile(r"^(white|#fff|#ffffff|rgb\(\s*255\s*,\s*255\s*,\s*255\s*\))
 
 @dataclass(frozen=True, slots=True)
 class Painted:
-    """One filled element: its rings (n, 2) in CSS pixels, y down; ``white`` is the colour of the paper."""
+    """One filled element: its rings (n, 2) in CSS pixels, y down; ``white`` is the colour of the paper.
+
+    ``open_rings`` of them end elsewhere than they start; a fill closes them.
+    """
 
     rings: list[Floats]
     rule: FillRule
     white: bool
+    open_rings: int
 
 
 def painted(data: bytes) -> list[Painted]:
@@ -50,7 +54,8 @@ def painted(data: bytes) -> list[Painted]:
             # abs applies the transform that a rotated or skewed element still carries
             rings = _rings(abs(svgelements.Path(element)))
             if rings:
-                found.append(Painted(rings, rule, bool(_WHITE.match(colour.strip()))))
+                open_rings = sum(not np.allclose(ring[0], ring[-1], rtol=1e-6, atol=1e-6) for ring in rings)
+                found.append(Painted(rings, rule, bool(_WHITE.match(colour.strip())), open_rings))
     return found
 
 

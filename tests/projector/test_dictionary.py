@@ -7,7 +7,8 @@ import shapely
 from shapely.affinity import rotate
 from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
 
-from projector import dictionary
+from lab.base.errors import ChordlabError
+from projector import collections
 from projector.dictionary import ShapeError, check_fits, load_dictionary, shape_from
 from projector.draw import draw_shape
 from projector.geojson import write_shape
@@ -188,13 +189,13 @@ def test_installed_wheel_finds_its_shapes_beside_the_module(tmp_path, monkeypatc
     package = tmp_path / "projector"
     (package / "shapes").mkdir(parents=True)
     write_shape(shapes["square"], package / "shapes" / "square.geojson")
-    monkeypatch.setattr(dictionary, "__file__", str(package / "dictionary.py"))
+    monkeypatch.setattr(collections, "__file__", str(package / "collections.py"))
     assert list(load_dictionary()) == ["square"]
     (package / "shapes" / "square.geojson").unlink()
-    with pytest.raises(dictionary.ChordlabError, match="holds no"):
+    with pytest.raises(ChordlabError, match="holds no"):
         load_dictionary()
     (package / "shapes").rmdir()
-    with pytest.raises(dictionary.ChordlabError, match="install chordlab again"):
+    with pytest.raises(ChordlabError, match="install chordlab again"):
         load_dictionary()
 
 

@@ -8,7 +8,7 @@ from shapely.geometry import Point, box, mapping
 from shapely.geometry import shape as from_mapping
 
 from projector import geojson
-from projector.geojson import load_json, parse_silhouette, read_shape, write_shape
+from projector.geojson import load_json, parse_drawing, read_shape, write_shape
 from projector.shape import Shape, ShapeError
 
 RING = [[0, 0], [4, 0], [4, 3], [0, 3], [0, 0]]
@@ -26,16 +26,16 @@ def feature(geometry):
 def test_every_kind_that_has_an_area():
     far = [[x + 10, y] for x, y in RING]
     touching = [[x + 4, y] for x, y in RING]
-    assert parse_silhouette(polygon(RING, HOLE), "s").area == 11
-    assert parse_silhouette(feature(polygon(RING)), "s").area == 12
+    assert parse_drawing(polygon(RING, HOLE), "s").geometry.area == 11
+    assert parse_drawing(feature(polygon(RING)), "s").geometry.area == 12
     both = {"type": "MultiPolygon", "coordinates": [[RING], [far]]}
-    assert len(parse_silhouette(both, "s").geoms) == 2
+    assert len(parse_drawing(both, "s").geometry.geoms) == 2
     collection = {"type": "FeatureCollection", "features": [feature(polygon(RING)), feature(polygon(touching))]}
-    joined = parse_silhouette(collection, "s")
+    joined = parse_drawing(collection, "s").geometry
     assert (joined.geom_type, joined.area) == ("Polygon", 24)
     nested = {"type": "GeometryCollection", "geometries": [polygon(RING)]}
-    assert parse_silhouette(nested, "s").area == 12
-    assert parse_silhouette(polygon([[*xy, 7] for xy in RING]), "s").area == 12
+    assert parse_drawing(nested, "s").geometry.area == 12
+    assert parse_drawing(polygon([[*xy, 7] for xy in RING]), "s").geometry.area == 12
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,7 @@ def test_every_kind_that_has_an_area():
 )
 def test_what_is_refused(data, words):
     with pytest.raises(ShapeError, match=words) as caught:
-        parse_silhouette(data, "drawing.geojson")
+        parse_drawing(data, "drawing.geojson")
     assert str(caught.value).startswith("drawing.geojson: ")
     assert "\n" not in str(caught.value)
 
@@ -70,10 +70,10 @@ def test_too_deep_and_too_many(monkeypatch):
     for _ in range(10):
         deep = {"type": "GeometryCollection", "geometries": [deep]}
     with pytest.raises(ShapeError, match="not GeoJSON"):
-        parse_silhouette(deep, "s")
+        parse_drawing(deep, "s")
     monkeypatch.setattr(geojson, "MAX_POINTS", 20)
     with pytest.raises(ShapeError, match="vertices"):
-        parse_silhouette(json.loads(json.dumps(mapping(Point(0, 0).buffer(1)))), "s")
+        parse_drawing(json.loads(json.dumps(mapping(Point(0, 0).buffer(1)))), "s")
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ RING = Point(200, 150).buffer(100, quad_segs=90).difference(Point(200, 150).buff
 
 
 def test_anti_aliased_outlines_are_found_between_the_pixels(tmp_path):
-    traced = read_image(saved(tmp_path, 255 - picture(RING)))
+    traced = read_image(saved(tmp_path, 255 - picture(RING))).geometry
     assert traced.area == pytest.approx(RING.area, rel=1e-3)
     assert traced.length == pytest.approx(RING.length, rel=2e-3)
     assert len(traced.interiors) == 1
@@ -39,15 +39,15 @@ def test_anti_aliased_outlines_are_found_between_the_pixels(tmp_path):
 
 def test_outlines_without_anti_aliasing_keep_their_length(tmp_path):
     stairs = np.where(picture(RING) > 127, 0, 255).astype(np.uint8)
-    traced = read_image(saved(tmp_path, stairs))
+    traced = read_image(saved(tmp_path, stairs)).geometry
     assert traced.area == pytest.approx(RING.area, rel=3e-3)
     # the stairs themselves would be 4/pi = 27 % longer, their marching squares 5 %
     assert traced.length == pytest.approx(RING.length, rel=0.01)
 
 
 def test_light_on_dark_and_dark_on_light_are_the_same(tmp_path):
-    light = read_image(saved(tmp_path, picture(RING)))
-    dark = read_image(saved(tmp_path, 255 - picture(RING), "dark.png"))
+    light = read_image(saved(tmp_path, picture(RING))).geometry
+    dark = read_image(saved(tmp_path, 255 - picture(RING), "dark.png")).geometry
     assert light.symmetric_difference(dark).area < 1.0
 
 
@@ -69,14 +69,14 @@ def test_a_statue_survives_the_way_through_a_picture(tmp_path):
 def test_shapes_that_the_edge_cuts_are_closed(tmp_path):
     image = np.full((60, 80), 255, np.uint8)
     image[40:, 20:60] = 0
-    assert read_image(saved(tmp_path, image)).area == pytest.approx(20 * 40, rel=0.01)
+    assert read_image(saved(tmp_path, image)).geometry.area == pytest.approx(20 * 40, rel=0.01)
 
 
 def test_transparency_cuts_the_shape_out(tmp_path):
     rgba = np.zeros((300, 400, 4), np.uint8)
     rgba[:, :, 0] = np.arange(400) % 256
     rgba[:, :, 3] = picture(RING)
-    assert read_image(saved(tmp_path, rgba)).area == pytest.approx(RING.area, rel=1e-3)
+    assert read_image(saved(tmp_path, rgba)).geometry.area == pytest.approx(RING.area, rel=1e-3)
 
 
 def test_jpeg_rings_and_dirt_leave_no_specks(tmp_path):
@@ -94,7 +94,7 @@ def test_a_turned_photo_is_turned_back(tmp_path):
     exif = Image.Exif()
     exif[0x0112] = 6  # shown a quarter turn clockwise
     Image.fromarray(image).save(tmp_path / "photo.jpg", exif=exif)
-    x0, y0, x1, y1 = read_image(tmp_path / "photo.jpg").bounds
+    x0, y0, x1, y1 = read_image(tmp_path / "photo.jpg").geometry.bounds
     assert (x1 - x0, y1 - y0) == pytest.approx((100, 300), abs=1)
 
 
@@ -133,7 +133,7 @@ def png_of_size(width, height):
     ("content", "words"),
     [
         (b"", "empty"),
-        (b"GIF89a not a png", "cannot be read as PNG or JPEG"),
+        (b"GIF89a not a png", "is no PNG or JPEG"),
         (png_of_size(8000, 8000), "8000 x 8000 pixels, more than 40 million"),
         (png_of_size(12_000, 12_000), "more than 40 million"),
         (png_of_size(100_000, 100_000), "cannot be read|more than"),
@@ -150,8 +150,8 @@ def test_files_that_are_no_picture_or_too_large(tmp_path, content, words):
 
 def test_limits(tmp_path, monkeypatch):
     path = saved(tmp_path, 255 - picture(RING))
-    monkeypatch.setattr(png, "MAX_POINTS", 50)
-    with pytest.raises(ShapeError, match="vertices"):
+    monkeypatch.setattr(png, "MAX_POINTS", 50)  # of pixels along the outline too
+    with pytest.raises(ShapeError, match="smooth the picture"):
         read_image(path)
     monkeypatch.setattr(png, "MAX_BYTES", 10)
     with pytest.raises(ShapeError, match="larger than"):
@@ -161,8 +161,8 @@ def test_limits(tmp_path, monkeypatch):
 def test_palettes_and_sixteen_bits_are_read(tmp_path):
     palette = Image.fromarray(255 - picture(RING)).convert("P")
     palette.save(tmp_path / "palette.png")
-    assert read_image(tmp_path / "palette.png").area == pytest.approx(RING.area, rel=2e-3)
+    assert read_image(tmp_path / "palette.png").geometry.area == pytest.approx(RING.area, rel=2e-3)
     deep = (65535 - 257 * picture(RING).astype(np.uint16)).astype(np.uint16)
     (tmp_path / "deep.png").write_bytes(cv2.imencode(".png", deep)[1].tobytes())
-    assert read_image(tmp_path / "deep.png").area == pytest.approx(RING.area, rel=2e-3)
+    assert read_image(tmp_path / "deep.png").geometry.area == pytest.approx(RING.area, rel=2e-3)
     assert Image.open(io.BytesIO((tmp_path / "deep.png").read_bytes())).mode.startswith("I")

@@ -36,9 +36,12 @@ def lit_moments(image, projector, height_cm):
     return total, (light * cx).sum() / total, (light * cy).sum() / total
 
 
-@pytest.mark.parametrize("name", ["circle", "square", "triangle", "chichen_itza", "eiffel", "liberty"])
+DRAWN = load_dictionary("paper") | load_dictionary("monuments")
+
+
+@pytest.mark.parametrize("name", DRAWN)
 def test_every_shape_has_its_true_area_in_the_sensors_plane(name):
-    shape = load_dictionary()[name]
+    shape = DRAWN[name]
     area, x, y = lit_moments(render(shape.geometry, STRAIGHT, SENSOR_CM), STRAIGHT, SENSOR_CM)
     assert area == pytest.approx(shape.area_cm2, rel=5e-4)
     assert (x, y) == pytest.approx(shape.geometry.centroid.coords[0], abs=0.01)

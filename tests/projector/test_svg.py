@@ -20,7 +20,7 @@ def written(tmp_path, body, head='width="200" height="200"', name="drawing.svg")
 
 def area(tmp_path, body, **kwargs):
     """The filled area in the drawing's CSS pixels."""
-    return read_svg(written(tmp_path, body, **kwargs))[0].area * CM**2
+    return read_svg(written(tmp_path, body, **kwargs)).geometry.area * CM**2
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 import hashlib
 import logging
 import string
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from projector import outlines
 from projector.dictionary import ShapeError, shape_from
 from projector.fill import fill
 from projector.outlines import installed_font, open_outlines
-from projector.text import find_font, glyph, set_text
+from projector.text import Typeface, find_font, glyph
 
 SQUARE = np.array([[0, 0], [4, 0], [4, 4], [0, 4]], dtype=float)
 
@@ -154,6 +155,20 @@ def test_no_font_at_all(monkeypatch):
         find_font()
 
 
+def test_a_font_installed_since_the_managers_list_was_made(dejavu, cubic_font, tmp_path, monkeypatch):
+    def knows_none(*args, **kwargs):
+        raise ValueError("none found")
+
+    junk = tmp_path / "junk.ttf"
+    junk.write_bytes(b"no font")
+    monkeypatch.setattr(outlines, "findfont", knows_none)
+    monkeypatch.setattr(outlines, "fontManager", SimpleNamespace(ttflist=[SimpleNamespace(fname=str(cubic_font))]))
+    monkeypatch.setattr(outlines, "findSystemFonts", lambda: [str(junk), str(cubic_font), str(dejavu.path)])
+    assert installed_font("DejaVu Sans") == dejavu.path
+    assert installed_font("Test") is None  # listed: the manager had its say
+    assert installed_font("Absent") is None
+
+
 def test_cubic_outlines(cubic_font):
     outlines_ = open_outlines(cubic_font)
     assert outlines_.name == "Test Regular"
@@ -184,21 +199,21 @@ def test_blanks_space_letters_out(cubic_font):
 )
 def test_texts_that_cannot_be_set(cubic_font, text, words):
     with pytest.raises(ShapeError, match=words) as caught:
-        set_text(text, find_font(cubic_font))
+        Typeface(find_font(cubic_font)).set(text)
     assert "\n" not in str(caught.value)
 
 
 def test_sizes_of_texts_must_be_above_zero(cubic_font):
     font = find_font(cubic_font)
     with pytest.raises(ShapeError, match="height must be above 0"):
-        set_text("H", font, cap_height_cm=-1)
+        Typeface(font).set("H", cap_height_cm=-1)
     with pytest.raises(ShapeError, match="width must be above 0"):
-        set_text("H", font, max_width_cm=0)
+        Typeface(font).set("H", max_width_cm=0)
 
 
 def test_a_letter_that_draws_nothing(dejavu):
     with pytest.raises(ShapeError, match="draws nothing"):
-        set_text("\u00a0\u200b", dejavu)
+        Typeface(dejavu).set("\u00a0\u200b")
 
 
 def test_files_that_are_no_font(tmp_path):
