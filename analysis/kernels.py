@@ -79,44 +79,6 @@ def ragged_invariants(t_cm: Floats, counts: Ints, k: Ints, l1_cm: Floats, l3_cm3
 
 
 @kernel
-def ragged_sort(t_cm: Floats, counts: Ints) -> None:
-    """Sort the crossings of every line in place (they are nearly sorted already)."""
-    first = 0
-    for line in range(counts.size):
-        last = first + counts[line]
-        for i in range(first + 1, last):
-            value = t_cm[i]
-            j = i - 1
-            while j >= first and t_cm[j] > value:
-                t_cm[j + 1] = t_cm[j]
-                j -= 1
-            t_cm[j + 1] = value
-        first = last
-
-
-@kernel
-def ragged_sampled(t_cm: Floats, counts: Ints, phase: Floats, step_cm: float, keep: NDArray[np.bool_]) -> None:
-    """Mark the crossings that a sensor read every ``step_cm`` can see.
-
-    Between two readings the light has changed only if an odd number of crossings lies there; the middle
-    one then stands for them. ``phase`` (lines,) in [0, 1) places the first reading of each line.
-    """
-    first = 0
-    for line in range(counts.size):
-        last = first + counts[line]
-        i = first
-        while i < last:
-            cell = np.floor(t_cm[i] / step_cm - phase[line])
-            j = i + 1
-            while j < last and np.floor(t_cm[j] / step_cm - phase[line]) == cell:
-                j += 1
-            if (j - i) % 2 == 1:
-                keep[(i + j) // 2] = True
-            i = j
-        first = last
-
-
-@kernel
 def trace_lines(
     uniforms: Floats,
     quota: int,

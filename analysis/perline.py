@@ -18,60 +18,20 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from analysis.boundary import Geometry
-from analysis.estimate import relative_covariance
-from analysis.invariants import area_cm2, perimeter_cm
-from analysis.kernels import ragged_sampled, ragged_sort
-from analysis.montecarlo import Lines, simulate_crossings
-from analysis.quadrature import Moments
+from analysis.montecarlo import simulate_lines
 from analysis.recognition import Weights, crossing_lines, log_prior, normalised, rank
+from analysis.sensor import SensorModel
 from lab.base.errors import RequestError
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Kinds = tuple[Ints, Floats, Floats]
 
 LENGTH_BINS = 128
 SPREAD_BINS = 24
 MAX_CHORDS = 8  # lines with more share the last table
+_BANDWIDTHS = (0.5, 0.25, 0.125, 0.0625, 0.0)  # shares of Scott's
 _BACKGROUND = 0.02  # share of lines that an entry leaves to what its table does not know
-
-
-@dataclass(frozen=True, slots=True)
-class LineModel:
-    """What the robot's sensor makes of an ideal line.
-
-    Attributes:
-        jitter_cm: standard deviation of each crossing's position.
-        min_chord_cm: distance rolled between two light readings. A lit or dark stretch shorter than this is
-            seen with probability length/min_chord_cm; a dark one that is missed joins its chords.
-        scale_sigma: relative standard deviation of a line's length (speed), common to all its crossings.
-    """
-
-    jitter_cm: float = 0.0
-    min_chord_cm: float = 0.0
-    scale_sigma: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name in self.__slots__:
-            value = float(getattr(self, name))
-            if not (np.isfinite(value) and value >= 0):
-                raise RequestError(f"line model: `{name}` must be 0 or more, got {value}")
-
-    def observe(self, lines: Lines, rng: np.random.Generator) -> Lines:
-        """Give the lines as the robot would report them; lines of which nothing is seen are gone."""
-        s_cm, counts = lines.s_cm, lines.counts
-        if self.min_chord_cm > 0:
-            keep = np.zeros(s_cm.size, dtype=bool)
-            ragged_sampled(s_cm, counts, rng.random(counts.size), self.min_chord_cm, keep)
-            owner = np.repeat(np.arange(counts.size), counts)
-            counts = np.bincount(owner[keep], minlength=counts.size)
-            counts = counts[counts > 0].astype(np.int64)
-            s_cm = s_cm[keep]
-        if self.scale_sigma > 0:
-            s_cm = s_cm * np.repeat(1 + self.scale_sigma * rng.standard_normal(counts.size), counts)
-        if self.jitter_cm > 0:
-            s_cm = s_cm + self.jitter_cm * rng.standard_normal(s_cm.size)
-            ragged_sort(s_cm, counts)
-        return Lines(s_cm, counts)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,27 +62,40 @@ def learn_tables(
     rng: np.random.Generator,
     *,
     lines: int = 100_000,
-    model: LineModel | None = None,
+    model: SensorModel | None = None,
     threads: int | None = None,
 ) -> LineTables:
     """Learn the tables of a dictionary from ``lines`` Monte Carlo lines of each entry.
 
-    With a ``model`` the lines are seen through the sensor first, which makes the dictionary match the robot.
-    Each table is smoothed with half of Scott's bandwidth and mixed with a little of what all entries share
-    and of a uniform table, so that a line that no entry explains moves no posterior far.
+    With a ``model`` the lines are seen through the sensor first.
 
     Raises:
         RequestError: no entries.
         analysis.boundary.BoundaryError: an entry's geometry is empty or invalid.
     """
-    names = tuple(entries)
+    seen: dict[str, Kinds] = {}
+    for name, geometry in entries.items():
+        if model is None:
+            seen[name] = simulate_lines(geometry, lines, rng, threads=threads)
+        else:
+            seen[name] = model.sense(geometry, lines, rng, threads=threads).invariants()
+    return tables_of(seen)
+
+
+def tables_of(seen: Mapping[str, Kinds]) -> LineTables:
+    """Make the tables of a dictionary from many lines of each entry: the arrays (k, 𝓛_1, 𝓛_3), k ≥ 1.
+
+    Lines as the robot's own sensor measures them (`analysis.tablestore.learn_lines`) make the dictionary match it.
+    Each table is smoothed, as far as its own lines bear out, and mixed with a little of what all entries share
+    and of a uniform table, so that a line that no entry explains moves no posterior far.
+
+    Raises:
+        RequestError: no entries.
+    """
+    names = tuple(seen)
     log_prior(names, None)
-    seen: list[tuple[Ints, Floats, Floats]] = []
-    for geometry in entries.values():
-        thrown = simulate_crossings(geometry, lines, rng, threads=threads)
-        seen.append((model.observe(thrown, rng) if model else thrown).invariants())
-    step_cm = 1.02 * max(float(l1_cm.max(initial=0.0)) for _, l1_cm, _ in seen) / (LENGTH_BINS - 1)
-    tables = np.stack([_table(*kind, step_cm) for kind in seen])
+    step_cm = 1.02 * max(float(l1_cm.max(initial=0.0)) for _, l1_cm, _ in seen.values()) / (LENGTH_BINS - 1)
+    tables = np.stack([_table(*kinds, step_cm) for kinds in seen.values()])
     uniform = np.zeros_like(tables[0])
     uniform[0, :, 0] = 1.0
     uniform[1:] = 1 / SPREAD_BINS
@@ -130,37 +103,6 @@ def learn_tables(
     # A single chord has u = 0: the other bins of that table are never looked up.
     probability = np.maximum((1 - _BACKGROUND) * tables + _BACKGROUND * background, np.finfo(float).tiny)
     return LineTables(names, step_cm, np.log(probability))
-
-
-def sensed_moments(
-    geometry: Geometry, model: LineModel, rng: np.random.Generator, *, lines: int = 400_000, threads: int | None = None
-) -> Moments:
-    """Moments of a shape as the robot's sensor sees it, for a sensor-matched `GaussianRecogniser`.
-
-    By Monte Carlo: area and perimeter are those that Eq. 1 gives for the sensed lines, and ``error`` is the
-    larger of their relative standard errors. The hitting measure is that of the lines of which something is
-    seen; the hull is the true shape's.
-    """
-    thrown = simulate_crossings(geometry, lines, rng, threads=threads)
-    lines_seen = model.observe(thrown, rng)
-    if lines_seen.counts.size < 2:
-        raise RequestError(f"this sensor sees nothing of the shape: take readings closer than {model.min_chord_cm} cm")
-    values = np.column_stack(lines_seen.invariants())
-    mean = values.mean(axis=0)
-    covariance = np.cov(values, rowvar=False)
-    relative = relative_covariance(mean, covariance)
-    # ⟨k⟩ of all the lines thrown measures how many lines hit: ∫[hit] dG = P/⟨k⟩.
-    hitting_measure = geometry.length / (thrown.counts.mean() / 2)
-    return Moments(
-        area_cm2=float(area_cm2(mean[1], mean[2])),
-        perimeter_cm=float(perimeter_cm(mean[0], mean[1], mean[2])),
-        hull_perimeter_cm=float(geometry.convex_hull.length),
-        hitting_measure_cm=float(hitting_measure * lines_seen.counts.size / lines),
-        mean=mean,
-        covariance=covariance,
-        relative=relative,
-        error=float(np.sqrt(np.diag(relative).max() / len(values))),
-    )
 
 
 class LineRecogniser:
@@ -236,11 +178,29 @@ def _table(k: Ints, l1_cm: Floats, l3_cm3: Floats, step_cm: float) -> Floats:
         used = layer[:, :1] if chords == 0 else layer
         dimensions = 1 if chords == 0 else 2
         widths = [_spread_of(used.sum(axis=1)), 0.0 if chords == 0 else _spread_of(used.sum(axis=0))]
-        bandwidth = [0.5 * width * count ** (-1 / (dimensions + 4)) for width in widths]
-        # "reflect" keeps the mass inside the table.
-        used[...] = np.asarray(ndimage.gaussian_filter(used, bandwidth, mode="reflect"), dtype=float)
+        scott = [width * count ** (-1 / (dimensions + 4)) for width in widths]
+        used[...] = max((_smoothed(used, scott, share) for share in _BANDWIDTHS), key=lambda found: found[0])[1]
     total = table.sum()
     return table / total if total > 0 else np.full_like(table, 1 / table.size)
+
+
+def _smoothed(counts: Floats, scott: list[float], share: float) -> tuple[float, Floats]:
+    """A histogram smoothed with a share of Scott's bandwidth, and how well that tells each line from the others.
+
+    That is the leave-one-out log-likelihood: a line adds the kernel's peak to its own bin, and without it the bin
+    must still expect it. A sensor's readings leave teeth in the lengths that Scott's rule alone would wipe out.
+    """
+    bandwidth = [share * width for width in scott]
+    # "reflect" keeps the mass inside the table.
+    smooth = np.asarray(ndimage.gaussian_filter(counts, bandwidth, mode="reflect"), dtype=float)
+    middle = np.zeros_like(counts)
+    centre = counts.shape[0] // 2, counts.shape[1] // 2
+    middle[centre] = 1.0
+    peak = ndimage.gaussian_filter(middle, bandwidth, mode="reflect")[centre]
+    others = np.maximum(smooth - peak, 0.0) / (counts.sum() - 1)
+    filled = counts > 0
+    expected = (1 - _BACKGROUND) * others[filled] + _BACKGROUND / counts.size
+    return float(counts[filled] @ np.log(expected)), smooth
 
 
 def _spread_of(counts: Floats) -> float:

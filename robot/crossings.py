@@ -85,6 +85,12 @@ def _level_and_noise(lux: NDArray[np.float64]) -> tuple[float, float]:
     return level, max(_MAD_TO_SIGMA * float(np.median(np.abs(lux - level))), NOISE_FLOOR_LUX)
 
 
+def threshold_margin(noise_lux: float, span_lux: float) -> float:
+    """Half of the hysteresis, lux, for levels ``span_lux`` apart and readings that scatter by ``noise_lux``."""
+    noise = max(noise_lux, NOISE_FLOOR_LUX)
+    return min(max(MARGIN_NOISES * noise, LEAST_MARGIN * span_lux), LARGEST_MARGIN * span_lux)
+
+
 def learn_levels(dark_lux: ArrayLike, bright_lux: ArrayLike, *, separation: float = SEPARATION_NOISES) -> Levels:
     """Learn the two levels; set the middle halfway and the thresholds six noise widths to either side of it.
 
@@ -124,7 +130,7 @@ def learn_levels(dark_lux: ArrayLike, bright_lux: ArrayLike, *, separation: floa
             **seen,
         )
     mid = low_level + 0.5 * span
-    margin = min(max(MARGIN_NOISES * noise, LEAST_MARGIN * span), LARGEST_MARGIN * span)
+    margin = threshold_margin(noise, span)
     return Levels(dark_lux=low_level, bright_lux=high_level, low_lux=mid - margin, mid_lux=mid, high_lux=mid + margin)
 
 

@@ -152,17 +152,11 @@ def test_no_line_gives_nan():
 
 
 @settings(max_examples=30, deadline=None)
-@given(st.lists(st.lists(st.floats(0.001, 9), min_size=2, max_size=10), max_size=5), st.integers(0, 2**32))
-def test_compiled_kernels_do_what_their_python_says(lines, seed):
+@given(st.lists(st.lists(st.floats(0.001, 9), min_size=2, max_size=10), max_size=5))
+def test_compiled_kernels_do_what_their_python_says(lines):
     even = [np.cumsum(line[: len(line) // 2 * 2]) for line in lines]
     counts = np.array([line.size for line in even], dtype=np.int64)
     t = np.concatenate([*even, np.empty(0)])
-    shuffled = np.concatenate([np.random.default_rng(seed).permutation(line) for line in even] + [np.empty(0)])
-    again = shuffled.copy()
-    kernels.ragged_sort(shuffled, counts)
-    kernels.ragged_sort.py_func(again, counts)
-    assert_allclose(shuffled, t)
-    assert_allclose(again, t)
     out = []
     for function in (kernels.ragged_invariants, kernels.ragged_invariants.py_func):
         k, l1, l3 = np.zeros(counts.size, np.int64), np.zeros(counts.size), np.zeros(counts.size)

@@ -8,7 +8,7 @@ from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
 
 from analysis import montecarlo
 from analysis.boundary import Boundary
-from analysis.kernels import available_cores, ragged_sampled, trace_lines
+from analysis.kernels import available_cores, trace_lines
 from analysis.montecarlo import running_bands, simulate, simulate_chords, simulate_crossings, simulate_lines
 from analysis.quadrature import exact_moments
 from lab.base.errors import RequestError
@@ -178,15 +178,6 @@ def test_progress_reaches_the_end(shapes, lines, rng):
     simulate(shapes["square"], lines=lines, runs=1, rng=rng, progress=lambda *done: seen.append(done))
     assert seen[-1] == (lines, lines)
     assert seen == sorted(seen)
-
-
-def test_a_sensor_read_in_steps_sees_odd_cells_only():
-    # Read at 0.5, 1.5, …: the crossing at 1 is seen, the pair 1.6, 2.0 is not, and of the next three the middle one.
-    for function in (ragged_sampled, ragged_sampled.py_func):
-        keep = np.zeros(7, dtype=bool)
-        t = np.array([1.0, 1.6, 2.0, 2.6, 2.8, 3.1, 1.0])
-        function(t, np.array([6, 1]), np.array([0.5, 0.5]), 1.0, keep)
-        assert keep.tolist() == [True, False, False, False, True, False, True]
 
 
 def test_requests_that_make_no_sense(shapes, rng, monkeypatch):

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import shapely
@@ -6,14 +8,15 @@ from scipy import stats
 from shapely import affinity
 from shapely.geometry import box
 
-from analysis.montecarlo import Lines, simulate_crossings, simulate_lines
-from analysis.perline import LineModel, LineRecogniser, learn_tables, sensed_moments
+from analysis.montecarlo import simulate_lines
+from analysis.perline import LineRecogniser, learn_tables
 from analysis.quadrature import exact_moments
 from analysis.recognition import FIRST_POSTERIOR_N, GaussianRecogniser, Recogniser, Weights
+from analysis.sensor import SensorModel
 from lab.base.errors import RequestError
 
 SIX = ("circle", "square", "triangle", "pyramid", "tower", "statue")
-SENSOR = LineModel(jitter_cm=0.4, min_chord_cm=1.25, scale_sigma=0.02)
+SENSOR = SensorModel(1.25, 0.4, margin=0.06, noise=0.01, speed_sigma=0.02)
 
 
 @pytest.fixture(scope="module")
@@ -42,9 +45,11 @@ def share_right(recogniser, six, lines, runs, rng, model=None):
     for name, geometry in six.items():
         good = 0
         for _ in range(runs):
-            thrown = simulate_crossings(geometry, lines, rng)
             recogniser.reset()
-            recogniser.update_many(*(model.observe(thrown, rng) if model else thrown).invariants())
+            if model is None:
+                recogniser.update_many(*simulate_lines(geometry, lines, rng))
+            else:
+                recogniser.update_many(*model.sense(geometry, lines, rng).invariants())
             good += recogniser.ranked()[0][0] == name
         right[name] = good / runs
     return right
@@ -60,9 +65,9 @@ def test_single_lines_recognise_six_shapes_in_100_lines(six, tables, rng):
     assert min(share_right(LineRecogniser(tables), six, 100, 100, rng).values()) >= 0.95
 
 
-@pytest.mark.parametrize("scale_sigma", [0.01, 0.03])
-def test_an_imperfect_sensor_is_met_by_a_matched_dictionary(six, sensed_tables, scale_sigma, rng):
-    world = LineModel(jitter_cm=0.4, min_chord_cm=1.25, scale_sigma=scale_sigma)
+@pytest.mark.parametrize("speed_sigma", [0.01, 0.03])
+def test_an_imperfect_sensor_is_met_by_a_matched_dictionary(six, sensed_tables, speed_sigma, rng):
+    world = replace(SENSOR, speed_sigma=speed_sigma)
     right = share_right(LineRecogniser(sensed_tables), six, 60, 60, rng, world)
     assert min(right.values()) >= 0.95
 
@@ -72,20 +77,6 @@ def test_a_systematic_error_of_length_is_borne(six, sensed_tables, rng):
         stretched = {name: affinity.scale(geometry, factor, factor) for name, geometry in six.items()}
         right = share_right(LineRecogniser(sensed_tables), stretched, 100, 40, rng, SENSOR)
         assert min(right.values()) >= 0.92
-
-
-def test_sensed_moments_put_the_area_and_perimeter_recogniser_right(six, moments, rng):
-    sensed = {name: sensed_moments(geometry, SENSOR, rng) for name, geometry in six.items()}
-    assert sensed["statue"].perimeter_cm < 0.95 * moments["statue"].perimeter_cm
-    plain = share_right(GaussianRecogniser(moments), six, 100, 60, rng, SENSOR)["statue"]
-    matched = share_right(GaussianRecogniser(sensed), six, 100, 60, rng, SENSOR)["statue"]
-    assert matched > plain
-    blind = LineModel(min_chord_cm=1e9)
-    with pytest.raises(RequestError, match="sees nothing"):
-        sensed_moments(six["square"], blind, rng)
-    ideal = sensed_moments(six["tower"], LineModel(), rng)
-    assert ideal.area_cm2 == pytest.approx(six["tower"].area, rel=5 * ideal.error)
-    assert ideal.hitting_measure_cm == pytest.approx(moments["tower"].hitting_measure_cm, rel=0.01)
 
 
 def test_posterior_means_what_it_says(six, tables, rng):
@@ -304,32 +295,6 @@ def test_shapes_of_one_area_and_perimeter_differ_line_by_line(rng):
     entries = {"ell": ell, "tee": tee}
     recogniser = LineRecogniser(learn_tables(entries, rng))
     assert min(share_right(recogniser, entries, 300, 40, rng).values()) >= 0.9
-
-
-def test_ideal_sensor_changes_nothing_and_each_fault_its_own(six, rng):
-    thrown = simulate_crossings(six["statue"], 5000, rng)
-    same = LineModel().observe(thrown, rng)
-    assert same.s_cm is thrown.s_cm
-    jittered = LineModel(jitter_cm=0.3).observe(thrown, rng)
-    assert np.std(jittered.s_cm - thrown.s_cm) == pytest.approx(0.3, rel=0.03)
-    shaken = LineModel(jitter_cm=5.0).observe(thrown, rng)
-    assert (shaken.chords_cm >= 0).all()
-    scaled = LineModel(scale_sigma=0.02).observe(thrown, rng)
-    ratio = scaled.chords_cm / thrown.chords_cm
-    assert ratio.std() == pytest.approx(0.02, rel=0.1)
-    with pytest.raises(RequestError, match="jitter_cm"):
-        LineModel(jitter_cm=-1)
-
-
-def test_a_short_stretch_is_seen_in_proportion_to_its_length(rng):
-    n = 40_000
-    chords = Lines(np.tile([0.0, 0.5], n), np.full(n, 2))
-    assert LineModel(min_chord_cm=2.0).observe(chords, rng).counts.size / n == pytest.approx(0.25, abs=0.01)
-    gaps = Lines(np.tile([0.0, 7.0, 7.5, 15.0], n), np.full(n, 4))
-    seen = LineModel(min_chord_cm=2.0).observe(gaps, rng)
-    assert (seen.counts == 4).mean() == pytest.approx(0.25, abs=0.01)
-    k, l1, _ = seen.invariants()
-    assert_allclose(l1[k == 1], 15.0)
 
 
 @pytest.mark.slow
