@@ -13,7 +13,7 @@ import numpy as np
 from lab.pictures import Picture, Pictures, check_on_floor, draw_pictures
 from lab.settings import Settings
 from lab.world import virtual_world
-from projector.device import ProjectorDevice, open_projector
+from projector.device import ProjectorDevice, ProjectorError, open_projector
 from projector.shape import Shape
 from robot.bolt import Bolt
 from robot.device import RobotDevice
@@ -21,6 +21,7 @@ from robot.selfguided import SelfGuided
 from tracking.cameras import Camera, open_camera
 from tracking.recorder import Recorder
 
+SETTLE_S = 0.3  # a projector's latency, and a light sample or a frame under way, after the picture changes
 _PUMP_EVERY_S = 0.5
 
 
@@ -47,6 +48,12 @@ class Bench:
         if changed is not None:
             changed()
 
+    def check_light(self) -> None:
+        """Raise ProjectorError when the projector's window has closed by itself: the robot would roll in the dark."""
+        problem: str | None = getattr(self.projector, "problem", None)
+        if problem is not None:
+            raise ProjectorError(problem)
+
     def devices(self) -> dict[str, Any]:
         """What the manifest keeps of the devices besides the robot's own identity."""
         return {
@@ -58,11 +65,12 @@ class Bench:
         }
 
 
-async def _keep_alive(projector: ProjectorDevice) -> None:
-    """Answer a window's events, or the desktop takes it for frozen; other projectors need nothing."""
+async def keep_alive(projector: ProjectorDevice) -> None:
+    """Answer a window's events until it closes, or the desktop takes it for frozen; others need nothing."""
     pump = getattr(projector, "pump", None)
     while pump is not None:
-        pump()
+        if not pump():
+            return
         await asyncio.sleep(_PUMP_EVERY_S)
 
 
@@ -92,7 +100,7 @@ async def open_bench(settings: Settings, shape: Shape, seed: np.random.SeedSeque
             projector = open_projector(settings.projector, image_size=optics.image_size)
             camera = None if settings.camera == "none" else open_camera(settings.camera)
         stack.callback(projector.close)
-        window = asyncio.create_task(_keep_alive(projector))
+        window = asyncio.create_task(keep_alive(projector))
         stack.callback(window.cancel)
         pictures = draw_pictures(
             shape.geometry, settings.arena, optics, settings.sensor.height_cm, projector.image_size

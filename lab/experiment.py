@@ -30,6 +30,7 @@ from projector.dictionary import load_dictionary, shape_from
 from projector.shape import Shape
 from robot.device import Identity
 
+_LONG_DICTIONARY = 30  # learning fewer takes seconds
 _VERSIONED = ("chordlab", "numpy", "shapely", "opencv-python-headless", "bleak", "bumble", "filterpy", "numba", "av")
 
 
@@ -51,9 +52,9 @@ class _Kept:
     outcome: Outcome | None = None
 
 
-def dictionary_with(shape: Shape) -> dict[str, Shape]:
-    """The dictionary, and the projected shape too where it is none of its entries."""
-    known = load_dictionary()
+def dictionary_with(shape: Shape, settings: Settings) -> dict[str, Shape]:
+    """The session's collection, and the projected shape too where it is none of its entries."""
+    known = load_dictionary(settings.dictionary, font=settings.font)
     return known if shape.name in known else {**known, shape.name: shape}
 
 
@@ -72,10 +73,10 @@ def run_experiment(
         ChordlabError: nothing was recorded, since the request was wrong or the preflight failed.
     """
     shape = shape_from(settings.shape, font=settings.font)
-    world_seed, turn_seed, _ = settings.seeds()
-    dictionary = dictionary_with(shape)
+    world_seed, turn_seed = settings.seeds()
+    dictionary = dictionary_with(shape, settings)
     say(f"dictionary: {len(dictionary)} entries; learning how each looks to a blind robot")
-    recogniser = recogniser_for(dictionary, settings)
+    recogniser = recogniser_for(dictionary, settings, progress=_tenths(say))
     kept = _Kept()
 
     async def on_the_bench() -> None:
@@ -106,6 +107,19 @@ def run_experiment(
     if kept.writer is None:  # not reached: without a folder the block above raised
         raise ChordlabError("the session left no folder; run chordlab doctor")
     return Finished(kept.writer.folder, kept.outcome, interrupted, failure)
+
+
+def _tenths(say: Callable[[str], None]) -> Callable[[int, int], None]:
+    """Say how much of a long dictionary is learnt, a line for each tenth of the way."""
+    told = 0
+
+    def progress(done: int, total: int) -> None:
+        nonlocal told
+        if total >= _LONG_DICTIONARY and 10 * done // total > told:
+            told = 10 * done // total
+            say(f"learnt {done} of {total} entries")
+
+    return progress
 
 
 def _session(

@@ -13,11 +13,12 @@ import pandas as pd
 
 from analysis.recognition import Recogniser
 from lab.base.errors import ChordlabError
-from lab.bench import Bench
+from lab.bench import SETTLE_S, Bench
 from lab.ledger import Ledger, Watcher
 from lab.pictures import Picture
+from lab.rigcheck import check_bench
 from lab.roller import SessionError, SessionLevels
-from lab.session import LEVEL_SAMPLES, SETTLE_S, Outcome, Preflight
+from lab.session import LEVEL_SAMPLES, Outcome, Preflight
 from lab.settings import Settings
 from lab.store import SessionWriter
 from robot.backoff import persist
@@ -100,6 +101,7 @@ class Listening:
         identity = await guest.identity()
         self._battery_v = identity.battery_v
         levels = learn_levels(await self._light_of(pictures.floor), await self._light_of(pictures.lit))
+        await check_bench(self._bench, self._settings)
         self._bench.show(pictures.shape)
         await asyncio.sleep(SETTLE_S)
         return Preflight((identity,), (SessionLevels(levels),))
@@ -124,6 +126,7 @@ class Listening:
                 await self._film(writer, runs)
                 line = await self._next(writer)
                 await self._keep(writer, line, runs)
+                self._bench.check_light()
                 runs += 1
                 state = self._ledger.reason_to_stop() or state
         except asyncio.CancelledError:

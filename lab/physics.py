@@ -36,6 +36,10 @@ class FaultSettings(Section):
 class VirtualSettings(Section):
     """The physical world of the virtual bench: what the devices do not know."""
 
+    camera_optics: Path | None = None
+    """A calibration.json of how the camera really hangs, without the session's knowing; none: as it believes."""
+    projector_optics: Path | None = None
+    """The same for the projector."""
     robot_profile: Path | None = None
     """A robot-profile.toml that the virtual robot obeys without the driver's knowing; none: the driver's own."""
     speed_error_sigma: Fraction = 0.02

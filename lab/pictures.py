@@ -23,6 +23,12 @@ _MARGIN_CM = {"bump": 0.35, "dark_ring": 1.0, "bright_ring": 1.0}
 _LIGHT = {"bump": (0.0, 1.0, 0.0), "dark_ring": (0.4, 1.0, 0.0), "bright_ring": (0.0, 0.4, 1.0)}
 
 
+def span_of(arena: ArenaSettings) -> float:
+    """How much brighter the shape is than the floor, of the projector's whole span."""
+    floor, lit, _ = _LIGHT[arena.edge]
+    return lit - floor
+
+
 @dataclass(frozen=True, slots=True)
 class Pictures:
     """Images, uint8 (height, width): the shape in its arena, and fields of the floor's, shape's and ring's light.

@@ -106,7 +106,7 @@ def examine(folder: Path, *, workers: int | None = None, progress: Progress | No
     settings, shape = stored_settings(session), stored_shape(session)
     rng = np.random.default_rng(settings.seed)
     tables = finalize(folder)
-    dictionary = dictionary_with(shape)
+    dictionary = dictionary_with(shape, settings)
     ranking, posteriors = _recognised(dictionary, settings, tables)
     return Reviewed(
         session=session,
@@ -127,7 +127,8 @@ def examine(folder: Path, *, workers: int | None = None, progress: Progress | No
 
 def recognised(session: SessionReader, tables: Tables) -> tuple[list[tuple[str, float]], pd.DataFrame]:
     """The final ranking, and ``n`` with one column for each entry: the posterior after each crossing line."""
-    return _recognised(dictionary_with(stored_shape(session)), stored_settings(session), tables)
+    settings = stored_settings(session)
+    return _recognised(dictionary_with(stored_shape(session), settings), settings, tables)
 
 
 def _recognised(

@@ -15,9 +15,10 @@ import numpy as np
 
 from analysis.recognition import Recogniser
 from lab.base.errors import ChordlabError
-from lab.bench import Bench
+from lab.bench import SETTLE_S, Bench
 from lab.ledger import Ledger, Watcher
 from lab.pictures import Picture
+from lab.rigcheck import check_bench
 from lab.roller import Roller, SessionError, SessionLevels
 from lab.run import Run
 from lab.settings import Settings
@@ -33,7 +34,6 @@ _log = logging.getLogger(__name__)
 
 LEVEL_SAMPLES = 20
 CONTACT_WINDOW_S = 0.05  # two reports of one contact, each with its latency; wider, walls met at once count too
-SETTLE_S = 0.3  # a projector's latency and a light sample under way, after the picture changes
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +109,7 @@ class Session:
             )
             for i in range(len(self._rollers))
         )
+        await check_bench(self._bench, self._settings)
         self._bench.show(pictures.shape)
         await asyncio.sleep(SETTLE_S)
         return Preflight(identities, levels)
@@ -164,6 +165,7 @@ class Session:
         while self._state == "failed":
             line, self._runs = self._runs, self._runs + 1
             run = await self._one_run(roller, leg, line)
+            self._bench.check_light()
             self._state = self._ledger.reason_to_stop() or self._state
             if self._state == "failed":
                 leg = await roller.next_leg(run)

@@ -192,6 +192,8 @@ class Settings(Section):
 
     shape: str = "eiffel"
     """A dictionary name, `text:WORD`, or a .geojson, .svg or .png file."""
+    dictionary: Literal["paper", "monuments", "letters", "words", "all"] = "paper"
+    """The collection that the robot chooses a name from; see `chordlab shapes list`."""
     seed: Annotated[int, Field(ge=0)] = 1
     """Everything random follows from it."""
     robot: str | tuple[str, ...] = "virtual"
@@ -217,6 +219,9 @@ class Settings(Section):
     """Where the camera hangs."""
     projector_optics: OpticsSettings = Field(default_factory=_projector_optics)
     """Where the projector hangs."""
+    rig_limit_mm: Annotated[float, Field(ge=0, le=100)] = 5.0
+    """A filmed session begins with markers on the floor; camera or projector off by more than this is refused. 0: no
+    such check."""
     virtual: VirtualSettings = VirtualSettings()
 
     @model_validator(mode="after")
@@ -281,10 +286,20 @@ class Settings(Section):
             profile = replace(profile, cm_s_per_unit=self.motion.cm_s_per_unit)
         return profile
 
-    def seeds(self) -> tuple[np.random.SeedSequence, np.random.SeedSequence, np.random.SeedSequence]:
-        """Independent seeds of the virtual world, of the robot's turns, and of what the dictionary is learnt from."""
-        world, turns, tables = np.random.SeedSequence(self.seed).spawn(3)
-        return world, turns, tables
+    def seeds(self) -> tuple[np.random.SeedSequence, np.random.SeedSequence]:
+        """Independent seeds of the virtual world and of the robot's turns."""
+        world, turns = np.random.SeedSequence(self.seed).spawn(2)
+        return world, turns
+
+    def true_optics(self) -> tuple[Pinhole, Pinhole]:
+        """How the virtual bench's camera and projector really hang, which no calibration is told."""
+        physics = self.virtual
+        return (
+            load_calibration(physics.camera_optics).optics if physics.camera_optics else self.camera_optics.pinhole(),
+            load_calibration(physics.projector_optics).optics
+            if physics.projector_optics
+            else self.projector_optics.pinhole(),
+        )
 
     def camera_calibration(self) -> Calibration:
         """The camera's optics with the height of the LED that it follows."""

@@ -70,8 +70,9 @@ async def virtual_world(
     """
     body_seed, camera_seed, air_seed = seed.spawn(3)
     physics = settings.virtual
+    camera_optics, projector_optics = settings.true_optics()
     projector = VirtualProjector(
-        settings.projector_optics.pinhole(),
+        projector_optics,
         LightSettings(
             ambient_lux=physics.ambient_lux,
             black_lux=physics.black_lux,
@@ -88,7 +89,7 @@ async def virtual_world(
     camera = None
     if settings.camera == "virtual":
         camera = VirtualCamera(
-            settings.camera_optics.pinhole(),
+            camera_optics,
             projector.light_at,
             robots_at,
             np.random.default_rng(camera_seed),

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from analysis.compare import squared_distance
+from analysis.estimate import Estimate
 from analysis.figures.blinks import blinks_figure, panels_at
 from analysis.figures.camera import agreement, chord_pairs_figure
 from analysis.figures.chords import Chords, chords_figure
 from analysis.figures.convergence import Convergence, convergence_figure, posterior_figure
 from analysis.figures.isotropy import isotropy_figure, lines_figure
 from analysis.figures.plane import plane_figure
+from analysis.figures.values import Entry
 from analysis.invariants import lit_lengths
 from analysis.report.result import SessionResult
 from analysis.report.words import number, p_value, percent, probability
 
+_PLANE_ENTRIES = 8  # more ellipses than this cover each other
 BLINK_COUNTS: tuple[int | None, ...] = (10, 100, None)
 
 
@@ -80,20 +84,33 @@ def _plane(result: SessionResult) -> Panel | LeftOut:
     measured = result.measured
     if measured is None:
         return LeftOut(title, _NO_LINE)
-    entries = result.dictionary or {result.name: result.exact}
+    entries = _nearest(result.dictionary or {result.name: result.exact}, measured, result.name)
     figure = plane_figure(entries, {result.name: result.estimates}, n=measured.n, camera=result.camera)
-    names = ", ".join(entry.title for entry in list(entries.values())[:8])
+    left_out = len(result.dictionary) - len(entries)
+    nearest = f" The {left_out} entries farther from the estimate are left out." if left_out > 0 else ""
+    names = ", ".join(entry.title for entry in entries.values())
     return Panel(
         "plane",
         title,
         figure,
         f"The robot's estimate moves through the plane of perimeter and area and ends at P = "
         f"{number(measured.perimeter_cm)} cm, A = {number(measured.area_cm2)} cm²; ellipses mark {len(entries)} "
-        f"entries: {names}{' and more' if len(entries) > 8 else ''}.",
+        f"entries: {names}.",
         f"The trace grows stronger as lines arrive. Ellipses hold 75, 95 and 99 % of the estimates after {measured.n} "
         "lines on each entry, by the exact moments. The last point should lie inside the ellipses of one entry only; "
-        "where ellipses overlap, more lines are needed.",
+        f"where ellipses overlap, more lines are needed.{nearest}",
     )
+
+
+def _nearest(entries: Mapping[str, Entry], measured: Estimate, name: str) -> dict[str, Entry]:
+    """The projected entry, and those whose ellipses lie nearest to the estimate, few enough to be told apart."""
+
+    def distance(entry: Entry) -> float:
+        gap = np.array([measured.area_cm2 - entry.area_cm2, measured.perimeter_cm - entry.perimeter_cm])
+        return squared_distance(gap, entry.covariance_at(measured.n))
+
+    kept = set(sorted(entries, key=lambda key: (key != name, distance(entries[key])))[:_PLANE_ENTRIES])
+    return {key: entry for key, entry in entries.items() if key in kept}
 
 
 def _convergence(result: SessionResult) -> Panel | LeftOut:

@@ -11,12 +11,17 @@ import typer
 from analysis.montecarlo import available_cores
 from lab.base.errors import RequestError
 from lab.calibrate import Scales, calibrate_robot, profile_to_update, scales_of_session
+from lab.cli import calibrate_optics
 from lab.cli.output import JsonFlag, complain, emit, progress_bar, say, show_table
 from lab.settings import load_settings
 from robot.characterise import applied, comments_of
 from robot.profile import RobotProfile, save_profile
 
 app = typer.Typer(help="Calibrate the bench's devices.", no_args_is_help=True)
+
+
+app.command("camera")(calibrate_optics.camera)
+app.command("projector")(calibrate_optics.projector)
 
 
 @app.callback()

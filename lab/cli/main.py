@@ -10,7 +10,7 @@ import typer
 from typer.exceptions import TyperException
 
 from lab.base.errors import ChordlabError
-from lab.cli import batch, calibrate, characterise, doctor, geometry, robot, run, shapes, track, validate
+from lab.cli import batch, calibrate, characterise, doctor, geometry, project, robot, run, shapes, track, validate
 from lab.cli.output import complain
 
 app = typer.Typer(
@@ -28,6 +28,7 @@ app.command("batch")(batch.batch)
 app.command("track")(track.track)
 app.command("moments")(geometry.moments)
 app.command("simulate")(geometry.simulate)
+app.command("project")(project.project)
 app.command("doctor")(doctor.doctor)
 app.add_typer(shapes.app, name="shapes")
 app.add_typer(robot.app, name="robot")

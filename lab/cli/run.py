@@ -34,6 +34,9 @@ def run(
         typer.Option(metavar="ROBOT", help="ble:SB-1234, onboard:CL-1234 or virtual; once for each robot."),
     ] = None,
     shape: Annotated[str | None, typer.Option(help="A dictionary name, text:WORD, or a shape file.")] = None,
+    dictionary: Annotated[
+        str | None, typer.Option(help="What to choose the name from: paper, monuments, letters, words or all.")
+    ] = None,
     lines: Annotated[int | None, typer.Option(help="Stop after this many lines that cross the shape.")] = None,
     until: Annotated[float | None, typer.Option(help="Stop once the leading posterior reaches this.")] = None,
     seed: Annotated[int | None, typer.Option(help="Everything random follows from it.")] = None,
@@ -50,7 +53,15 @@ def run(
         session,
         simulate,
         no_video,
-        {"robot": robot or None, "shape": shape, "stop.lines": lines, "stop.until": until, "seed": seed, "out": out},
+        {
+            "robot": robot or None,
+            "shape": shape,
+            "dictionary": dictionary,
+            "stop.lines": lines,
+            "stop.until": until,
+            "seed": seed,
+            "out": out,
+        },
     )
     hushed = quiet or as_json
     began_s = time.perf_counter()
