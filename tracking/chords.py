@@ -13,7 +13,9 @@ from tracking.runs import column
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-CHORDS = ("line", "chord", "s_in_cm", "s_out_cm", "length_cm", "t_in_s", "t_out_s", "x_cm", "y_cm")
+CHORDS = (
+    "line", "chord", "s_in_cm", "s_out_cm", "length_cm", "t_in_s", "t_out_s", "x_cm", "y_cm", "sigma_length_cm", "sure",
+)  # fmt: skip
 MARGIN_CM = 1.0  # an edge may lie this far off by sampling and footprint
 _STRAYING = 0.01  # overlap that a cm of straying must buy
 
@@ -23,7 +25,9 @@ def chord_table(crossings: pd.DataFrame) -> pd.DataFrame:
 
     Returns:
         One row a chord: ``line chord s_in_cm s_out_cm length_cm t_in_s t_out_s x_cm y_cm`` (its centre; NaN where the
-        crossings carry no place or time). A crossing without its partner (a missed edge) makes no chord.
+        crossings carry no place or time), ``sigma_length_cm`` (0 where they carry none) and ``sure`` (whether it is
+        surely there; so is one whose crossings do not say). A crossing without its partner (a missed edge) makes no
+        chord.
 
     Raises:
         TrackError: a column is missing.
@@ -38,6 +42,10 @@ def chord_table(crossings: pd.DataFrame) -> pd.DataFrame:
         name: column(crossings, name)[order] if name in crossings.columns else np.full(len(line), np.nan)
         for name in ("t_s", "x_cm", "y_cm")
     }
+    said = {
+        name: column(crossings, name)[order] if name in crossings.columns else np.full(len(line), otherwise)
+        for name, otherwise in (("sigma_length_cm", 0.0), ("sure", 1.0))
+    }
     number = line[first].astype(np.int64)
     begun = np.searchsorted(number, number, side="left")
     return pd.DataFrame(
@@ -51,6 +59,8 @@ def chord_table(crossings: pd.DataFrame) -> pd.DataFrame:
             "t_out_s": extra["t_s"][last],
             "x_cm": (extra["x_cm"][first] + extra["x_cm"][last]) / 2,
             "y_cm": (extra["y_cm"][first] + extra["y_cm"][last]) / 2,
+            "sigma_length_cm": said["sigma_length_cm"][first],
+            "sure": said["sure"][first] > 0.5,
         },
         columns=list(CHORDS),
     )

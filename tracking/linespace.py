@@ -143,70 +143,155 @@ def uniforms(theta_rad: ArrayLike, p_cm: ArrayLike, reachable: Polygon) -> tuple
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Wall:
+    """The boundary of a convex region: places on it are counted in cm along it, counter-clockwise."""
+
+    points: Floats
+    tangents: Floats
+    inward: Floats
+    begins_cm: Floats
+    perimeter_cm: float
+
+    @classmethod
+    def of(cls, region: Polygon) -> Wall:
+        """The boundary of a convex polygon; raises RegionError for anything else."""
+        points = corners(region)
+        edges = np.roll(points, -1, axis=0) - points
+        lengths: Floats = np.asarray(np.hypot(edges[:, 0], edges[:, 1]), dtype=float)
+        tangents = edges / lengths[:, None]
+        begins = np.concatenate([[0.0], np.cumsum(lengths)])
+        inward = np.column_stack([-tangents[:, 1], tangents[:, 0]])
+        return cls(points, tangents, inward, begins[:-1], float(begins[-1]))
+
+    def at(self, place_cm: Floats) -> tuple[Floats, NDArray[np.intp]]:
+        """The points (n, 2) at places (n,) along the wall, and the edges they lie on."""
+        edge = np.clip(np.searchsorted(self.begins_cm, place_cm, side="right") - 1, 0, len(self.points) - 1)
+        return self.points[edge] + (place_cm - self.begins_cm[edge])[:, None] * self.tangents[edge], edge
+
+    def place_cm(self, position: Floats, edge: NDArray[np.intp]) -> Floats:
+        """The places (n,) of points (n, 2) on these edges."""
+        along = np.einsum("ij,ij->i", position - self.points[edge], self.tangents[edge])
+        return np.asarray(self.begins_cm[edge] + along, dtype=float)
+
+    def heading(self, edge: NDArray[np.intp], sine: Floats) -> Floats:
+        """Unit vectors (n, 2) that leave these edges at the inward angle arcsin(sine) to their normals."""
+        cosine = np.sqrt(1.0 - sine * sine)
+        return cosine[:, None] * self.inward[edge] + sine[:, None] * self.tangents[edge]
+
+    def next_edge(self, position: Floats, heading: Floats, edge: NDArray[np.intp]) -> NDArray[np.intp]:
+        """The edge each robot meets next, by bisection.
+
+        Counter-clockwise from the edge just left the corners lie right of the heading up to the edge it meets
+        and left of it from there on.
+        """
+        count = len(self.points)
+        low, high = np.ones_like(edge), np.full_like(edge, count)
+        for _ in range(int(np.ceil(np.log2(count))) + 1):
+            middle = (low + high) // 2
+            towards = self.points[(edge + middle) % count] - position
+            right = heading[:, 0] * towards[:, 1] - heading[:, 1] * towards[:, 0] <= 0
+            low = np.where(right, middle, low)
+            high = np.where(right, high, np.maximum(middle, low + 1))
+        return (edge + low) % count
+
+    def ends_cm(self, theta_rad: Floats, p_cm: Floats) -> Floats:
+        """The places (n, 2) where lines leave the region; a line that misses it is moved to its nearest corner."""
+        normal = np.column_stack([np.cos(theta_rad), np.sin(theta_rad)])
+        height = normal @ self.points.T
+        low, high = height.min(axis=1), height.max(axis=1)
+        slack = 1e-9 * (high - low)
+        above = height > np.clip(p_cm, low + slack, high - slack)[:, None]
+        rising = np.argmax(~above & np.roll(above, -1, axis=1), axis=1)
+        falling = np.argmax(above & ~np.roll(above, -1, axis=1), axis=1)
+        places: list[Floats] = []
+        for edge in (rising, falling):
+            here = np.take_along_axis(height, edge[:, None], axis=1)[:, 0]
+            climb = np.einsum("ij,ij->i", normal, self.tangents[edge])
+            span = np.diff(np.append(self.begins_cm, self.perimeter_cm))[edge]
+            places.append(self.begins_cm[edge] + np.clip((p_cm - here) / climb, 0.0, span))
+        return np.stack(places, axis=1)
+
+
+def line_of(position: Floats, heading: Floats) -> tuple[Floats, Floats]:
+    """(theta, p) of the lines through points (n, 2) along unit vectors (n, 2), theta in [0, pi)."""
+    theta = np.arctan2(heading[:, 0], -heading[:, 1])
+    p = position[:, 1] * heading[:, 0] - position[:, 0] * heading[:, 1]
+    flip = np.floor(theta / np.pi)
+    return np.asarray(theta - flip * np.pi, dtype=float), np.where(flip % 2 != 0, -p, p)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Rolls:
-    """Runs of simulated robots: every array is (chains, runs)."""
+    """Runs of simulated robots, every array (chains, runs); start and end are places along the wall."""
 
     theta_rad: Floats
     p_cm: Floats
     length_cm: Floats
+    start_cm: Floats
+    end_cm: Floats
 
 
-def _next_wall(points: Floats, position: Floats, heading: Floats, wall: NDArray[np.intp]) -> NDArray[np.intp]:
-    """The edge each robot meets next, by bisection.
-
-    Counter-clockwise from the wall just left the corners lie right of the heading up to the edge it meets
-    and left of it from there on.
-    """
-    count = len(points)
-    low, high = np.ones_like(wall), np.full_like(wall, count)
-    for _ in range(int(np.ceil(np.log2(count))) + 1):
-        middle = (low + high) // 2
-        towards = points[(wall + middle) % count] - position
-        right = heading[:, 0] * towards[:, 1] - heading[:, 1] * towards[:, 0] <= 0
-        low = np.where(right, middle, low)
-        high = np.where(right, high, np.maximum(middle, low + 1))
-    return (wall + low) % count
-
-
-def roll(reachable: Polygon, chains: int, runs: int, rng: np.random.Generator, *, successive: bool = True) -> Rolls:
+def roll(
+    reachable: Polygon,
+    chains: int,
+    runs: int,
+    rng: np.random.Generator,
+    *,
+    successive: bool = True,
+    begins: NDArray[np.bool_] | None = None,
+    shortest_cm: float = 0.0,
+) -> Rolls:
     """Roll ``chains`` robots for ``runs`` straight runs each, leaving every wall by Lambert's cosine law.
 
     The inward angle phi to the wall's normal has the density cos(phi)/2, phi = arcsin(2u - 1). A start
     that is uniform along the wall then stays so, and every line is isotropic and homogeneous
     (Evans, Ann. Appl. Probab. 11 (2001) 419), while lines that follow each other share an end and are
-    dependent. ``successive=False`` draws a fresh start for each run: independent lines of the same law.
+    dependent.
+
+    Args:
+        reachable: convex polygon in which the ball's centre moves.
+        chains: robots.
+        runs: runs of each that are kept.
+        rng: source of starts and angles.
+        successive: False draws a fresh start for each run: independent lines of the same law.
+        begins: (runs,), true for the runs that start afresh where others follow the run before.
+        shortest_cm: shorter runs are rolled but not kept.
+
+    Raises:
+        RegionError: the region is not convex.
+        RequestError: runs of ``shortest_cm`` hardly occur.
     """
-    points = corners(reachable)
-    edges = np.roll(points, -1, axis=0) - points
-    lengths: Floats = np.asarray(np.hypot(edges[:, 0], edges[:, 1]), dtype=float)
-    tangents = edges / lengths[:, None]
-    inward = np.column_stack([-tangents[:, 1], tangents[:, 0]])
-    offsets = np.einsum("ij,ij->i", inward, points)
-    ends: Floats = np.asarray(np.cumsum(lengths), dtype=float)
-    theta, p, length = (np.empty((runs, chains)) for _ in range(3))
-
-    def fresh_start() -> tuple[Floats, NDArray[np.intp]]:
-        place: Floats = rng.random(chains) * ends[-1]
-        wall: NDArray[np.intp] = np.minimum(np.searchsorted(ends, place, side="right"), len(ends) - 1)
-        back = ends[wall] - place
-        return points[wall] + (lengths[wall] - back)[:, None] * tangents[wall], wall
-
-    position, wall = fresh_start()
-    for run in range(runs):
-        if run and not successive:
-            position, wall = fresh_start()
-        sine = 2.0 * rng.random(chains) - 1.0
-        cosine = np.sqrt(1.0 - sine * sine)
-        heading = cosine[:, None] * inward[wall] + sine[:, None] * tangents[wall]
-        wall = _next_wall(points, position, heading, wall)
-        closing = np.maximum(-np.einsum("ij,ij->i", heading, inward[wall]), 1e-12)
-        step = np.maximum((np.einsum("ij,ij->i", position, inward[wall]) - offsets[wall]) / closing, 0.0)
-        normal_angle = np.arctan2(heading[:, 0], -heading[:, 1])
-        theta[run] = normal_angle
-        p[run] = position[:, 1] * heading[:, 0] - position[:, 0] * heading[:, 1]
-        length[run] = step
-        position = position + step[:, None] * heading
-    flip = np.floor(theta / np.pi)
-    theta -= flip * np.pi
-    p[flip % 2 != 0] *= -1.0
-    return Rolls(theta.T.copy(), p.T.copy(), length.T.copy())
+    wall = Wall.of(reachable)
+    offsets = np.einsum("ij,ij->i", wall.inward, wall.points)
+    afresh = np.full(runs, not successive) if begins is None else np.array(begins, dtype=bool)
+    afresh[:1] = True
+    kept = {name: np.empty((chains, runs)) for name in Rolls.__slots__}
+    count, everyone = np.zeros(chains, dtype=np.intp), np.arange(chains)
+    place = np.zeros(chains)
+    position, edge = wall.at(place)
+    steps = 0
+    while int(count.min()) < runs:
+        steps += 1
+        if steps > 20 * (runs + 50):
+            raise RequestError(
+                f"runs of at least {shortest_cm:g} cm hardly occur in this region; lower shortest_cm below its diameter"
+            )
+        fresh = afresh[np.minimum(count, runs - 1)]
+        if fresh.any():
+            place = np.where(fresh, rng.random(chains) * wall.perimeter_cm, place)
+            begun, begun_edge = wall.at(place)
+            position, edge = np.where(fresh[:, None], begun, position), np.where(fresh, begun_edge, edge)
+        heading = wall.heading(edge, 2.0 * rng.random(chains) - 1.0)
+        theta, p = line_of(position, heading)
+        edge = wall.next_edge(position, heading, edge)
+        closing = np.maximum(-np.einsum("ij,ij->i", heading, wall.inward[edge]), 1e-12)
+        length = np.maximum((np.einsum("ij,ij->i", position, wall.inward[edge]) - offsets[edge]) / closing, 0.0)
+        position = position + length[:, None] * heading
+        reached = wall.place_cm(position, edge)
+        stored = (length >= shortest_cm) & (count < runs)
+        row = everyone[stored]
+        for name, values in zip(Rolls.__slots__, (theta, p, length, place, reached), strict=True):
+            kept[name][row, count[stored]] = values[stored]
+        count += stored
+        place = reached
+    return Rolls(**kept)

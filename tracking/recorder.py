@@ -98,6 +98,7 @@ class Recorder:
         self._pump_task: asyncio.Task[None] | None = None
         self._path: Path | None = None
         self._overruns = 0
+        self._late = 0
         self._failure: BaseException | None = None
 
     @property
@@ -109,6 +110,11 @@ class Recorder:
     def dropped(self) -> int:
         """Frames lost so far: at the camera, and here because the encoder was behind."""
         return self.camera.dropped + self._overruns
+
+    @property
+    def late(self) -> int:
+        """Frames of the segments closed so far that reached us more than half a period after they were due."""
+        return self._late
 
     @property
     def failure(self) -> BaseException | None:
@@ -187,10 +193,13 @@ class Recorder:
     async def _finished(self, done: Future[SegmentInfo]) -> SegmentInfo:
         try:
             if self.camera.live:
-                return await asyncio.wait_for(asyncio.wrap_future(done), self._timeout_s)
-            return done.result(self._timeout_s)
+                segment = await asyncio.wait_for(asyncio.wrap_future(done), self._timeout_s)
+            else:
+                segment = done.result(self._timeout_s)
         except TimeoutError as error:
             raise RecorderError(f"the video encoder did not finish within {self._timeout_s:g} s") from error
+        self._late += segment.late
+        return segment
 
     async def _order(self, order: _Order) -> None:
         """Queue an order that must not be lost."""

@@ -6,19 +6,21 @@ somewhere in a step, of variance w: it adds w [[dt²/3, dt/2], [dt/2, 1]]. Measu
 The smoother is that of Rauch, Tung & Striebel (1965). ``tracking.kalman`` holds the same filter on filterpy.
 """
 
-# numba's decorators carry no types: the functions behind them are typed here by hand.
-# pyright: reportUnknownMemberType=false, reportUntypedFunctionDecorator=false, reportMissingTypeStubs=false
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from lab.base.compiled import compiled
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
+_LATEST_SHOWN = 8  # measurements, at most, from a turn to that in which it shows
+_LEAST_CHANCE = 0.01  # of a step to have held a turn, over the likeliest one's: below, it gets no kick
 
-@njit(cache=True)
+
+@compiled()
 def process_noise(dt_s: float, q: float, kick_var: float) -> tuple[float, float, float]:
     """Give the process noise (xx, xv, vv) of a step of ``dt_s`` with a kick of variance ``kick_var`` (0 = none)."""
     xx = q * dt_s**3 / 3.0 + kick_var * dt_s**2 / 3.0
@@ -26,7 +28,7 @@ def process_noise(dt_s: float, q: float, kick_var: float) -> tuple[float, float,
     return xx, xv, q * dt_s + kick_var
 
 
-@njit(cache=True)
+@compiled()
 def smooth_axis(
     t_s: Floats, z: Floats, r: Floats, use: Flags, kick_var: Floats, q: float, start_var_v: float
 ) -> tuple[Floats, Floats, Floats]:
@@ -97,7 +99,7 @@ def smooth_axis(
     return xs, vs, cov
 
 
-@njit(cache=True)
+@compiled()
 def plan(
     t_s: Floats,
     x: Floats,
@@ -108,98 +110,152 @@ def plan(
     kick_var: float,
     start_var_v: float,
     gate: float,
-) -> tuple[Flags, Floats, Floats]:
+) -> tuple[Flags, Floats, Floats, float]:
     """Decide for each measurement of a track whether it is taken, and where the velocity jumps.
 
     A measurement whose normalised innovation squared exceeds ``gate`` is an outlier if a later one, within three,
-    agrees again with the prediction; else the robot has turned, and the step gets a kick.
+    agrees again with the prediction; else the robot has turned, and the last steps share a kick, each by how likely a
+    turn in it makes the measurements since and the next one.
 
     Returns:
-        Which are taken (n,), the kicks' variances (n,), the normalised innovations squared (n,), NaN where none.
+        Which are taken (n,); the kicks' variances (n,); the innovations (n, 2) over their predicted standard
+        deviations, NaN where there was no measurement, those of a turn with its kick allowed for; half the deviance
+        -2 ln L of the whole track, in which no measurement counts for more than the gate lets pass.
     """
     n = len(t_s)
     use = np.zeros(n, dtype=np.bool_)
     kicks = np.zeros(n)
-    nis = np.full(n, np.nan)
+    innovations = np.full((n, 2), np.nan)
+    cost = 0.0
     use[0] = True
-    px, py, vx, vy = x[0], y[0], 0.0, 0.0
-    a = np.array([rx[0], 0.0, start_var_v])
-    b = np.array([ry[0], 0.0, start_var_v])
+    # Of each sample: x, vx, xx, xv, vv of the one axis, then of the other.
+    states = np.zeros((n, 10))
+    states[0] = np.array([x[0], 0.0, rx[0], 0.0, start_var_v, y[0], 0.0, ry[0], 0.0, start_var_v])
     for k in range(1, n):
         dt = t_s[k] - t_s[k - 1]
-        qxx, qxv, qvv = process_noise(dt, q, 0.0)
-        px += dt * vx
-        py += dt * vy
-        for p in (a, b):
-            p[0] += 2.0 * dt * p[1] + dt * dt * p[2] + qxx
-            p[1] += dt * p[2] + qxv
-            p[2] += qvv
+        states[k] = states[k - 1]
+        _predict(states[k], dt, q, 0.0)
         if not (np.isfinite(x[k]) and np.isfinite(y[k])):
             continue
-        dx, dy = x[k] - px, y[k] - py
-        odd = dx * dx / (a[0] + rx[k]) + dy * dy / (b[0] + ry[k])
+        sx, sy = states[k, 2] + rx[k], states[k, 7] + ry[k]
+        dx, dy = x[k] - states[k, 0], y[k] - states[k, 5]
+        odd = dx * dx / sx + dy * dy / sy
+        innovations[k, 0], innovations[k, 1] = dx / np.sqrt(sx), dy / np.sqrt(sy)
+        cost += 0.5 * (min(odd, gate) + np.log(sx) + np.log(sy))
         if odd > gate:
-            if _agrees_later(k, t_s, x, y, rx, ry, px, py, vx, vy, a, b, q, gate):
+            if _agrees_later(k, t_s, x, y, rx, ry, states[k], q, gate):
                 continue
-            kicks[k] = kick_var
-            kxx, kxv, kvv = process_noise(dt, 0.0, kick_var)
-            for p in (a, b):
-                p[0] += kxx
-                p[1] += kxv
-                p[2] += kvv
-            odd = dx * dx / (a[0] + rx[k]) + dy * dy / (b[0] + ry[k])
-            if odd > gate:
+            # The turn may have been anywhere since the last measurement that was taken.
+            last = k - 1
+            while not use[last]:
+                last -= 1
+            trial = states[last].copy()
+            _predict(trial, t_s[k] - t_s[last], q, kick_var)
+            if (x[k] - trial[0]) ** 2 / (trial[2] + rx[k]) + (y[k] - trial[5]) ** 2 / (trial[7] + ry[k]) > gate:
                 # Too far for any turn: a mistaken spot, even if what follows should not agree either.
-                kicks[k] = 0.0
-                for p in (a, b):
-                    p[0] -= kxx
-                    p[1] -= kxv
-                    p[2] -= kvv
                 continue
-        else:
-            nis[k] = odd
+            use[k] = True
+            _turn(k, t_s, x, y, rx, ry, use, kicks, innovations, states, q, kick_var)
+            continue
         use[k] = True
-        sx, sy = a[0] + rx[k], b[0] + ry[k]
-        px += a[0] / sx * dx
-        vx += a[1] / sx * dx
-        py += b[0] / sy * dy
-        vy += b[1] / sy * dy
-        a[2] -= a[1] * a[1] / sx
-        a[1] *= rx[k] / sx
-        a[0] *= rx[k] / sx
-        b[2] -= b[1] * b[1] / sy
-        b[1] *= ry[k] / sy
-        b[0] *= ry[k] / sy
-    return use, kicks, nis
+        _update(states[k], x[k], y[k], rx[k], ry[k])
+    return use, kicks, innovations, cost
 
 
-@njit(cache=True)
-def _agrees_later(
+@compiled()
+def _predict(state: Floats, dt_s: float, q: float, kick_var: float) -> None:
+    """Carry the state of both axes over a step, in place."""
+    qxx, qxv, qvv = process_noise(dt_s, q, kick_var)
+    for o in (0, 5):
+        state[o] += dt_s * state[o + 1]
+        state[o + 2] += 2.0 * dt_s * state[o + 3] + dt_s * dt_s * state[o + 4] + qxx
+        state[o + 3] += dt_s * state[o + 4] + qxv
+        state[o + 4] += qvv
+
+
+@compiled()
+def _update(state: Floats, x: float, y: float, rx: float, ry: float) -> float:
+    """Take a measurement into the state of both axes, in place: half its deviance."""
+    half = 0.0
+    for o, z, r in ((0, x, rx), (5, y, ry)):
+        s = state[o + 2] + r
+        gain_x, gain_v = state[o + 2] / s, state[o + 3] / s
+        innovation = z - state[o]
+        state[o] += gain_x * innovation
+        state[o + 1] += gain_v * innovation
+        state[o + 4] -= gain_v * state[o + 3]
+        state[o + 3] *= r / s
+        state[o + 2] *= r / s
+        half += 0.5 * (innovation * innovation / s + np.log(s))
+    return half
+
+
+@compiled()
+def _turn(
     k: int,
     t_s: Floats,
     x: Floats,
     y: Floats,
     rx: Floats,
     ry: Floats,
-    px: float,
-    py: float,
-    vx: float,
-    vy: float,
-    a: Floats,
-    b: Floats,
+    use: Flags,
+    kicks: Floats,
+    innovations: Floats,
+    states: Floats,
     q: float,
-    gate: float,
+    kick_var: float,
+) -> None:
+    """Share the kick of a turn that showed at sample k among the last steps by their chances, and filter on from there.
+
+    A slight turn shows some frames late: the sum of its innovations must outgrow the noise.
+    """
+    until = k + 1
+    while until < len(t_s) and not (np.isfinite(x[until]) and np.isfinite(y[until])):
+        until += 1
+    until = min(until, len(t_s) - 1)
+    earliest = k
+    costs = [np.inf]
+    costs.clear()
+    seen = 0
+    for first in range(k, 0, -1):
+        if kicks[first] > 0.0 or seen == _LATEST_SHOWN:
+            break
+        earliest = first
+        seen += use[first]
+        state = states[first - 1].copy()
+        cost = 0.0
+        for m in range(first, until + 1):
+            _predict(state, t_s[m] - t_s[m - 1], q, kick_var if m == first else 0.0)
+            if use[m] or (m > k and np.isfinite(x[m]) and np.isfinite(y[m])):
+                cost += _update(state, x[m], y[m], rx[m], ry[m])
+        costs.append(cost)
+    chances = np.array([np.exp(min(costs) - cost) for cost in costs])
+    chances /= np.sum(chances)
+    # Through a long gap each step's chance is small, but the turn was in one of them.
+    chances[chances < _LEAST_CHANCE * np.max(chances)] = 0.0
+    for m in range(earliest, k + 1):
+        kicks[m] = kick_var * chances[k - m]
+    for m in range(earliest, k + 1):
+        states[m] = states[m - 1]
+        _predict(states[m], t_s[m] - t_s[m - 1], q, kicks[m])
+        if use[m]:
+            innovations[m, 0] = (x[m] - states[m, 0]) / np.sqrt(states[m, 2] + rx[m])
+            innovations[m, 1] = (y[m] - states[m, 5]) / np.sqrt(states[m, 7] + ry[m])
+            _update(states[m], x[m], y[m], rx[m], ry[m])
+
+
+@compiled()
+def _agrees_later(
+    k: int, t_s: Floats, x: Floats, y: Floats, rx: Floats, ry: Floats, state: Floats, q: float, gate: float
 ) -> bool:
     """Whether one of the next three measurements lies where the prediction at sample k goes on to."""
     looked = 0
     for m in range(k + 1, len(t_s)):
         if not (np.isfinite(x[m]) and np.isfinite(y[m])):
             continue
-        dt = t_s[m] - t_s[k]
-        qxx = process_noise(dt, q, 0.0)[0]
-        vxx = a[0] + 2.0 * dt * a[1] + dt * dt * a[2] + qxx + rx[m]
-        vyy = b[0] + 2.0 * dt * b[1] + dt * dt * b[2] + qxx + ry[m]
-        if (x[m] - px - dt * vx) ** 2 / vxx + (y[m] - py - dt * vy) ** 2 / vyy <= gate:
+        ahead = state.copy()
+        _predict(ahead, t_s[m] - t_s[k], q, 0.0)
+        if (x[m] - ahead[0]) ** 2 / (ahead[2] + rx[m]) + (y[m] - ahead[5]) ** 2 / (ahead[7] + ry[m]) <= gate:
             return True
         looked += 1
         if looked == 3:

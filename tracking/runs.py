@@ -17,6 +17,8 @@ from scipy.ndimage import median_filter
 from scipy.optimize import isotonic_regression
 
 from lab.base.errors import RequestError
+from tracking.bow import fit_bow
+from tracking.straight import FINEST_CM, TUKEY, Straight, straight_through
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -33,15 +35,17 @@ TRUE_LINES = (
     "t_end_s",
     "length_cm",
     "rms_cm",
+    "pivot_cm",
+    "sigma_pivot_cm",
+    "sigma_theta_rad",
+    "bend_cm",
+    "sigma_bend_cm",
     "n_frames",
     "reason",
 )
 _MOVING = 0.2  # share of the cruising speed above which the robot counts as rolling
 _LONGEST_PAUSE_S = 0.25  # a hidden LED or one bad frame does not end a run
-_TUKEY = 4.685  # 95 % efficiency on Gaussian residuals
-_FINEST_CM = 0.02  # no camera here is better: keeps the weights finite on noiseless tracks
-_STARTS = 64
-_ROUNDS = 12
+_FEWEST_FOR_BEND = 8
 
 
 class TrackError(RequestError):
@@ -59,22 +63,14 @@ class _Frames:
     t_s: Floats
     xy_cm: Floats
     weight: Floats
+    raw_cm: Floats  # as measured, whose errors are each frame's own; NaN where bridged
+    raw_weight: Floats
 
     def between(self, first: int, last: int) -> _Frames:
-        return _Frames(self.t_s[first : last + 1], self.xy_cm[first : last + 1], self.weight[first : last + 1])
+        return self.only(np.arange(first, last + 1))
 
-    def only(self, kept: NDArray[np.bool_]) -> _Frames:
-        return _Frames(self.t_s[kept], self.xy_cm[kept], self.weight[kept])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Straight:
-    """A line through frames: a point on it, the unit vector of travel, residuals (n,) and their scale."""
-
-    point_cm: Floats
-    along: Floats
-    residual_cm: Floats
-    scale_cm: float
+    def only(self, kept: NDArray[np.bool_] | NDArray[np.intp]) -> _Frames:
+        return _Frames(self.t_s[kept], self.xy_cm[kept], self.weight[kept], self.raw_cm[kept], self.raw_weight[kept])
 
 
 def column(table: pd.DataFrame, name: str) -> Floats:
@@ -94,9 +90,17 @@ def _frames(track: pd.DataFrame) -> tuple[Floats, Floats, Floats]:
     weight = np.ones(len(xy))
     if "sigma_x_cm" in track.columns and "sigma_y_cm" in track.columns:
         variance = (column(track, "sigma_x_cm") ** 2 + column(track, "sigma_y_cm") ** 2) / 2
-        weight = np.where(np.isfinite(variance), 1.0 / (np.nan_to_num(variance) + _FINEST_CM**2), 0.0)
+        weight = np.where(np.isfinite(variance), 1.0 / (np.nan_to_num(variance) + FINEST_CM**2), 0.0)
         xy[weight == 0] = np.nan
     return column(track, "t_s"), xy, weight
+
+
+def _raw(track: pd.DataFrame, xy_cm: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    """Measured positions (n, 2) in cm and their weights (n,); the smoothed ones where the track holds no others."""
+    if "x_cm" not in track.columns or "y_cm" not in track.columns:
+        return xy_cm, weight
+    # The sigmas of a track are those of its smoothed positions: they do not tell the measured ones apart.
+    return np.column_stack([column(track, "x_cm"), column(track, "y_cm")]), np.ones(len(track))
 
 
 def _rate(t_s: Floats, value: Floats) -> Floats:
@@ -119,41 +123,6 @@ def _longest_stretch(moving: NDArray[np.bool_], t_s: Floats, speed_cm_s: Floats)
     return int(firsts[best]), int(lasts[best])
 
 
-def _straight(frames: _Frames) -> _Straight:
-    """Weighted total least squares with Tukey's biweight, from the best of many two-point lines.
-
-    The start is the line through two frames half a run apart with the least median residual (Rousseeuw 1984),
-    so up to half of the frames may lie anywhere.
-    """
-    xy = frames.xy_cm
-    half = max(len(xy) // 2, 1)
-    first = np.unique(np.linspace(0, len(xy) - half - 1, _STARTS).astype(int))
-    chord = xy[first + half] - xy[first]
-    size = np.hypot(chord[:, 0], chord[:, 1])
-    chord[size == 0] = (1.0, 0.0)
-    chord /= np.where(size == 0, 1.0, size)[:, None]
-    off = (xy[None, :, 1] - xy[first, None, 1]) * chord[:, :1] - (xy[None, :, 0] - xy[first, None, 0]) * chord[:, 1:]
-    best = int(np.argmin(np.where(size == 0, np.inf, np.median(np.abs(off), axis=1))))
-    point, along, residual = xy[first[best]], chord[best], np.asarray(off[best], dtype=float)
-    scale = _FINEST_CM
-    for _ in range(_ROUNDS):
-        scale = max(1.4826 * float(np.median(np.abs(residual))), _FINEST_CM)
-        pull = frames.weight * np.clip(1.0 - (residual / (_TUKEY * scale)) ** 2, 0.0, None) ** 2
-        point = np.average(xy, axis=0, weights=pull)
-        centred = xy - point
-        _, vectors = np.linalg.eigh((centred * pull[:, None]).T @ centred)
-        turned = np.asarray(vectors[:, 1], dtype=float)
-        settled = abs(float(along @ turned)) > 1 - 1e-14
-        along = turned
-        residual = centred[:, 1] * along[0] - centred[:, 0] * along[1]
-        if settled:
-            break
-    progress = (xy - point) @ along
-    if float(np.median(progress[half:]) - np.median(progress[: len(xy) - half])) < 0:
-        along, residual = -along, -residual
-    return _Straight(np.asarray(point, dtype=float), along, residual, scale)
-
-
 def _rolling(frames: _Frames, fewest: int, shortest_cm: float) -> tuple[_Frames | None, str]:
     """The frames of the longest roll along one line, or the reason why there are none."""
     # a single bad frame looks like two leaps
@@ -167,7 +136,7 @@ def _rolling(frames: _Frames, fewest: int, shortest_cm: float) -> tuple[_Frames 
     if stretch is None or stretch[1] - stretch[0] + 1 < fewest:
         return None, f"the robot rolled in less than {fewest} frames"
     moving = frames.between(*stretch)
-    line = _straight(moving)
+    line = straight_through(moving.xy_cm, moving.weight)
     # what is rolled before or after in another direction belongs to the neighbouring runs
     on_line = moving.only(np.abs(line.residual_cm) < max(6.0 * line.scale_cm, 0.3))
     forward = _rate(on_line.t_s, on_line.xy_cm @ line.along)
@@ -177,15 +146,17 @@ def _rolling(frames: _Frames, fewest: int, shortest_cm: float) -> tuple[_Frames 
     return on_line.between(*stretch), ""
 
 
-def _fit(frames: _Frames, fewest: int, crookedest_cm: float, shortest_cm: float) -> tuple[dict[str, float], str]:
+def _fit(
+    frames: _Frames, fewest: int, crookedest_cm: float, shortest_cm: float, systematic_cm: float
+) -> tuple[dict[str, float], str]:
     """The numbers of one run, or the reason why there are none."""
     if len(frames.t_s) < fewest:
         return {}, f"LED seen in {len(frames.t_s)} frames, {fewest} needed"
     rolled, reason = _rolling(frames, fewest, shortest_cm)
     if rolled is None:
         return {}, reason
-    line = _straight(rolled)
-    kept = np.abs(line.residual_cm) < _TUKEY * line.scale_cm
+    line = straight_through(rolled.xy_cm, rolled.weight)
+    kept = np.abs(line.residual_cm) < TUKEY * line.scale_cm
     rms = float(np.sqrt(np.mean(line.residual_cm[kept] ** 2)))
     progress = (rolled.xy_cm[kept] - line.point_cm) @ line.along
     begin, end = float(progress[0]), float(progress[-1])
@@ -193,6 +164,9 @@ def _fit(frames: _Frames, fewest: int, crookedest_cm: float, shortest_cm: float)
         return {"rms_cm": rms}, f"not straight: {rms:.1f} cm rms, {crookedest_cm:g} allowed"
     if end - begin < max(shortest_cm, 10 * rms):
         return {"rms_cm": rms}, f"rolled only {end - begin:.1f} cm, too short to tell its direction"
+    line, errors = _scatter(rolled, line, begin, end, systematic_cm)
+    progress = (rolled.xy_cm[kept] - line.point_cm) @ line.along
+    begin, end = float(progress[0]), float(progress[-1])
     normal = np.array([-line.along[1], line.along[0]])
     theta = float(np.arctan2(normal[1], normal[0]))
     p = float(normal @ line.point_cm)
@@ -201,7 +175,7 @@ def _fit(frames: _Frames, fewest: int, crookedest_cm: float, shortest_cm: float)
     if theta >= np.pi:
         theta, p = 0.0, -p
     start, stop = line.point_cm + begin * line.along, line.point_cm + end * line.along
-    return {
+    return errors | {
         "theta_rad": theta,
         "p_cm": p,
         "x_start_cm": float(start[0]),
@@ -216,8 +190,49 @@ def _fit(frames: _Frames, fewest: int, crookedest_cm: float, shortest_cm: float)
     }, ""
 
 
+def _scatter(
+    frames: _Frames, line: Straight, begin_cm: float, end_cm: float, systematic_cm: float
+) -> tuple[Straight, dict[str, float]]:
+    """The line put right by the measured positions, with its errors and the run's bend.
+
+    Smoothed positions lean on each other; the measured ones say how well the line is known.
+    """
+    away = frames.raw_cm - line.point_cm
+    off = away[:, 1] * line.along[0] - away[:, 0] * line.along[1]
+    half = (end_cm - begin_cm) / 2.0
+    u = (away @ line.along - begin_cm) / half - 1.0
+    known = np.isfinite(off) & (np.abs(u) <= 1.0)
+    if known.any():
+        known &= np.abs(off) < TUKEY * max(1.4826 * float(np.median(np.abs(off[known]))), FINEST_CM)
+    if int(known.sum()) < _FEWEST_FOR_BEND:
+        return line, {}
+    bow = fit_bow(u[known], off[known], frames.raw_weight[known])
+    lateral, mixed, turning = bow.covariance[0, 0], bow.covariance[0, 1], bow.covariance[1, 1]
+    pivot = -mixed / turning if turning > 0.0 else 0.0
+    normal = np.array([-line.along[1], line.along[0]])
+    turned = line.along + bow.straight[1] / half * normal
+    straight = Straight(
+        line.point_cm + (begin_cm + half) * line.along + bow.straight[0] * normal,
+        turned / np.hypot(*turned),
+        line.residual_cm,
+        line.scale_cm,
+    )
+    return straight, {
+        "pivot_cm": half * (1.0 + pivot),
+        "sigma_pivot_cm": float(np.sqrt(max(lateral + pivot * mixed, 0.0) + systematic_cm**2)),
+        "sigma_theta_rad": float(np.sqrt(turning)) / half,
+        "bend_cm": bow.bend,
+        "sigma_bend_cm": bow.sigma_bend,
+    }
+
+
 def fit_lines(
-    track: pd.DataFrame, *, fewest_frames: int = 5, crookedest_cm: float = 2.0, shortest_cm: float = 1.0
+    track: pd.DataFrame,
+    *,
+    fewest_frames: int = 5,
+    crookedest_cm: float = 2.0,
+    shortest_cm: float = 1.0,
+    systematic_cm: float = 0.0,
 ) -> pd.DataFrame:
     """Fit the straight line of every run.
 
@@ -228,17 +243,24 @@ def fit_lines(
         fewest_frames: rolling frames that a line needs.
         crookedest_cm: a run whose frames stray farther, rms, is no straight line.
         shortest_cm: a robot that rolled less has no direction.
+        systematic_cm: how far all positions of a run may be off together (see `track.systematic_cm`); it becomes part
+            of ``sigma_pivot_cm``.
 
     Returns:
         One row a line, in order: ``line theta_rad p_cm x_start_cm y_start_cm x_end_cm y_end_cm t_start_s
-        t_end_s length_cm rms_cm n_frames reason``. theta in [0, pi) is the direction of the normal, p the
-        signed distance, end points in order of travel, rms of the distances from the line. ``reason`` is
-        empty for a fitted line; else it says why there is none and the numbers are NaN, n_frames 0.
+        t_end_s length_cm rms_cm pivot_cm sigma_pivot_cm sigma_theta_rad bend_cm sigma_bend_cm n_frames reason``.
+        theta in [0, pi) is the direction of the normal, p the signed distance, end points in order of travel, rms of
+        the distances from the line. ``pivot_cm``: the place from the run's start where the errors of the line's
+        position (``sigma_pivot_cm``, across it) and direction do not depend on each other, so that s cm from the start
+        the line lies uncertain by the root of sigma_pivot² + (s - pivot)² sigma_theta². ``bend_cm``: how far the run
+        bows out at its middle, left of the way it went positive. ``reason`` is empty for a fitted line; else it says
+        why there is none and the numbers are NaN, n_frames 0.
 
     Raises:
         TrackError: a column is missing, or the rows are of several robots.
     """
     t_all, xy_all, weight_all = _frames(track)
+    raw_all, raw_weight_all = _raw(track, xy_all, weight_all)
     number = column(track, "line")
     seen = np.isfinite(xy_all).all(axis=1) & np.isfinite(t_all)
     rows: list[dict[str, float | str]] = []
@@ -248,7 +270,11 @@ def fit_lines(
     for index in np.split(order, bounds) if len(order) else []:
         used = index[seen[index]]
         fitted, reason = _fit(
-            _Frames(t_all[used], xy_all[used], weight_all[used]), max(fewest_frames, 3), crookedest_cm, shortest_cm
+            _Frames(t_all[used], xy_all[used], weight_all[used], raw_all[used], raw_weight_all[used]),
+            max(fewest_frames, 3),
+            crookedest_cm,
+            shortest_cm,
+            systematic_cm,
         )
         row: dict[str, float | str] = dict.fromkeys(TRUE_LINES, np.nan)
         row |= fitted

@@ -19,6 +19,7 @@ from av.codec.codec import UnknownCodecError
 from av.container import OutputContainer
 from av.error import FFmpegError
 from av.video.stream import VideoStream
+from numpy.typing import ArrayLike
 
 from lab.base.errors import RequestError
 from tracking.cameras import Frame
@@ -68,7 +69,9 @@ class EncoderSettings:
 class SegmentInfo:
     """A closed segment: camera times of its first and last frame (NaN if it has none, and then no file either).
 
-    ``dropped`` counts the frames lost before each of its frames, the gap to the segment before included.
+    ``dropped`` counts the frames lost before each of its frames, the gap to the segment before included; ``late``
+    those that reached us more than half a period after they were due by the camera's clock, which says that this
+    machine or its bus was busy (their times are the camera's and remain right).
     """
 
     path: Path
@@ -77,6 +80,7 @@ class SegmentInfo:
     t_first_s: float
     t_last_s: float
     codec: str
+    late: int = 0
 
 
 def frames_table(path: str | Path) -> Path:
@@ -86,6 +90,16 @@ def frames_table(path: str | Path) -> Path:
     (float), dropped_before (int).
     """
     return Path(path).with_suffix(".frames.parquet")
+
+
+def late_frames(t_camera_s: ArrayLike, t_host_s: ArrayLike, rate_hz: float) -> int:
+    """Count the frames that came more than half a period after they were due.
+
+    Due is what the camera's clock says, after the shortest way that any of these frames took. A camera without a clock
+    of its own shows no late frames, but gaps.
+    """
+    way_s = np.asarray(t_host_s, dtype=float) - np.asarray(t_camera_s, dtype=float)
+    return int((way_s > way_s.min() + 0.5 / rate_hz).sum()) if len(way_s) else 0
 
 
 def part_of(path: str | Path) -> Path:
@@ -148,6 +162,7 @@ class SegmentWriter:
             t_first_s=times[0] if times else math.nan,
             t_last_s=times[-1] if times else math.nan,
             codec=self._codec,
+            late=late_frames([row[1] for row in self._rows], [row[2] for row in self._rows], self._rate_hz),
         )
 
     def abandon(self) -> None:

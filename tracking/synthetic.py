@@ -77,7 +77,10 @@ class CameraSettings:
 
 @dataclass(frozen=True, slots=True)
 class RobotView:
-    """What the camera can see of one robot: its centre (cm), its velocity, its LED's level (0..1)."""
+    """What the camera can see of one robot: its centre (cm), its velocity, its LED's level (0..1).
+
+    ``led_uv``: the steps of U and V that come with each step of the LED's luma; by default those of red.
+    """
 
     x_cm: float
     y_cm: float
@@ -86,6 +89,17 @@ class RobotView:
     vy_cm_s: float = 0.0
     led_height_cm: float = 7.3
     radius_cm: float = 3.65
+    led_uv: tuple[float, float] = (_LED_U, _LED_V)
+
+
+@dataclass(frozen=True, slots=True)
+class Glint:
+    """A white reflex of some lamp on the floor: its centre in the picture (px), its height in luma, its radius."""
+
+    x_px: float
+    y_px: float
+    luma: float = 200.0
+    sigma_px: float = 3.0
 
 
 class OverheadScene:
@@ -137,11 +151,20 @@ class OverheadScene:
             self._light_floor()
         return self._clean
 
-    def render(self, robots: Sequence[RobotView] = ()) -> Plane:
-        """Draw one frame, packed I420 (h · 3/2, w) uint8."""
+    def render(
+        self, robots: Sequence[RobotView] = (), *, light: Floats | None = None, glints: Sequence[Glint] = ()
+    ) -> Plane:
+        """Draw one frame, packed I420 (h · 3/2, w) uint8.
+
+        Args:
+            robots: what there is to see of each.
+            light: (h,) factor of the projected light in each row of pixels, where the lamp flickers; else None.
+            glints: reflexes on the floor; a ball in front hides them.
+        """
         if self._stale:
             self._light_floor()
         width, height = self.optics.image_size
+        floor = self._clean8 if light is None else self._under(light)
         pixels = width * height
         start, colour_start = (int(value) for value in self._rng.integers(0, (pixels, pixels // 2)))
         brighter = self._brighter[start : start + pixels].reshape(height, width)
@@ -149,12 +172,20 @@ class OverheadScene:
         packed: Plane = np.empty((height * 3 // 2, width), dtype=np.uint8)
         luma = packed[:height]
         # Unsigned, saturating and in two passes: several times faster than signed or float arithmetic on all pixels.
-        cv2.add(self._clean8, brighter, dst=luma)
+        cv2.add(floor, brighter, dst=luma)
         cv2.subtract(luma, darker, dst=luma)
         packed.reshape(-1)[pixels:] = self._colour[colour_start : colour_start + pixels // 2]
+        for glint in glints:
+            self._draw_glint(glint, packed, brighter, darker)
         for robot in robots:
-            self._draw_robot(robot, packed, brighter, darker)
+            self._draw_robot(robot, packed, brighter, darker, light)
         return packed
+
+    def _under(self, light: Floats) -> Plane:
+        """The floor under a flickering lamp."""
+        black = np.float32(self.settings.black_luma)
+        lit = (self._clean - black) * np.asarray(light, dtype=np.float32)[:, None] + black
+        return np.clip(np.rint(lit), 0.0, 255.0).astype(np.uint8)
 
     def _light_floor(self) -> None:
         lux = self._light_at(self._floor_x.ravel().astype(float), self._floor_y.ravel().astype(float), 0.0)
@@ -165,7 +196,18 @@ class OverheadScene:
         self._clean8 = np.rint(self._clean).astype(np.uint8)
         self._stale = False
 
-    def _draw_robot(self, robot: RobotView, packed: Plane, brighter: Plane, darker: Plane) -> None:
+    def _draw_glint(self, glint: Glint, packed: Plane, brighter: Plane, darker: Plane) -> None:
+        centre = np.array([[glint.x_px, glint.y_px]])
+        if (box := self._box(centre, 5.0 * glint.sigma_px)) is None:
+            return
+        rows, columns = (np.arange(side.start, side.stop, dtype=float) for side in box)
+        patch = _without_noise(packed, brighter, darker, box)
+        patch += np.float32(glint.luma) * _spot(columns, rows, centre, glint.sigma_px)
+        _with_noise(patch, packed, brighter, darker, box)
+
+    def _draw_robot(
+        self, robot: RobotView, packed: Plane, brighter: Plane, darker: Plane, light: Floats | None
+    ) -> None:
         # Three equal taps at ±L/√8 have the variance L²/12 of a smear of length L.
         tap_s = self.settings.exposure_s / math.sqrt(8.0)
         points = [(robot.x_cm, robot.y_cm, robot.radius_cm)]
@@ -182,11 +224,11 @@ class OverheadScene:
         reach_px = reach * robot.radius_cm * float(self.optics.camera_matrix[0, 0]) / depth_cm
         if (box := self._box(seen[:1], reach_px)) is not None:
             patch = _without_noise(packed, brighter, darker, box)
-            self._draw_ball(robot, patch, box)
+            self._draw_ball(robot, patch, box, None if light is None else light[box[0]])
             _with_noise(patch, packed, brighter, darker, box)
         if (box := self._box(seen[1:], 5.0 * self.settings.led_sigma_px)) is not None:
             patch = _without_noise(packed, brighter, darker, box)
-            self._draw_led(robot.led_level, seen[1:], patch, packed, box)
+            self._draw_led(robot, seen[1:], patch, packed, box)
             _with_noise(patch, packed, brighter, darker, box)
 
     def _box(self, around: Floats, reach_px: float) -> tuple[slice, slice] | None:
@@ -199,24 +241,28 @@ class OverheadScene:
         bottom = min(height, int(high[1]) // block * block + block)
         return np.s_[top:bottom, left:right] if min(right - left, bottom - top) >= block else None
 
-    def _draw_led(self, level: float, seen: Floats, patch: Floats32, packed: Plane, box: tuple[slice, slice]) -> None:
+    def _draw_led(
+        self, robot: RobotView, seen: Floats, patch: Floats32, packed: Plane, box: tuple[slice, slice]
+    ) -> None:
         """Add the LED's glow to a patch of luma, in place, and to the picture's colour planes."""
         sigma_px = self.settings.led_sigma_px
         rows, columns = (np.arange(side.start, side.stop, dtype=float) for side in box)
-        peak = self.settings.led_luma * level
+        peak = self.settings.led_luma * robot.led_level
         patch += peak * _spot(columns, rows, seen, sigma_px)
         colour_box = tuple(slice(side.start // 2, side.stop // 2) for side in box)
         colour = peak * _spot(columns[::2] / 2.0, rows[::2] / 2.0, (seen - 0.5) / 2.0, sigma_px / 2.0)
-        for plane, share in zip(chroma_planes(packed), (_LED_U, _LED_V), strict=True):
+        for plane, share in zip(chroma_planes(packed), robot.led_uv, strict=True):
             plane[colour_box] = np.clip(np.rint(plane[colour_box] + share * colour), 16.0, 240.0)
 
-    def _draw_ball(self, robot: RobotView, patch: Floats32, box: tuple[slice, slice]) -> None:
-        """Draw the shadow and the sphere into a patch of floor luma, in place."""
+    def _draw_ball(self, robot: RobotView, patch: Floats32, box: tuple[slice, slice], flicker: Floats | None) -> None:
+        """Draw shadow and sphere into a patch of floor luma, in place; ``flicker``: the lamp's factor in its rows."""
         settings = self.settings
         radius_cm = np.float32(robot.radius_cm)
         x_cm, y_cm = self._floor_x[box], self._floor_y[box]
         ball = np.array([robot.x_cm, robot.y_cm, robot.radius_cm])
         gain = np.float32(settings.luma_per_lux) * self._fall_off[box]
+        if flicker is not None:
+            gain = gain * flicker.astype(np.float32)[:, None]
         if self._light_from is not None:
             miss_cm, _ = _ray_miss(self._light_from, x_cm, y_cm, ball)
             umbra = np.clip((radius_cm - miss_cm) * np.float32(1.0 / 0.4) + np.float32(0.5), 0.0, 1.0)

@@ -1,14 +1,12 @@
-"""True crossings, from the true lines and the shape, and how the robot's crossings compare with them.
+"""True crossings, from the true lines and the shape, with their errors.
 
-Chords are compared, not areas: a chord is what one line lights between an entering and the next leaving
-crossing, and the robot's chords differ from the true ones by reasons that show in their statistics:
-threshold and footprint (bias), odometry (scale), sampling and noise (spread), missed chords.
+The place of a crossing comes from the whole run's line, not from a frame: it errs by how far the line may lie beside
+itself, over the tangent of the angle at which it meets the edge. So a grazing crossing errs much, and whether the
+robot lit a sliver of an edge at all may be more than the camera can tell.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,30 +16,28 @@ from numpy.typing import NDArray
 from shapely import MultiPolygon, Polygon
 
 from lab.base.errors import RequestError
-from tracking.chords import MARGIN_CM, Alignment, align, chord_table
+from tracking.paths import RunPath, run_paths
 from tracking.runs import column, place_along
 
 Floats = NDArray[np.float64]
 
-TRUE_CROSSINGS = ("line", "order", "t_s", "s_cm", "entering", "x_cm", "y_cm")
-PAIRS = (
+TRUE_CROSSINGS = (
     "line",
-    "robot_length_cm",
-    "true_length_cm",
-    "difference_cm",
-    "mean_length_cm",
-    "robot_centre_cm",
-    "true_centre_cm",
+    "order",
+    "t_s",
+    "s_cm",
+    "entering",
     "x_cm",
     "y_cm",
-    "offset_cm",
-    "overlap",
+    "sigma_s_cm",
+    "sigma_t_s",
+    "sigma_length_cm",
+    "sure",
 )
-_TOUCHING_CM = 1e-6
-_SLACK_CM = 2.0  # how far one line's offset may stray from the median offset
-_FEWEST_FOR_SCALE = 8
-_LARGEST_SCALE_ERROR = 0.25
-_SCALE_ROUNDS = 3  # more chords match once the scale is nearly right
+NEAR_CHORDS = ("line", "s_in_cm", "s_out_cm")
+_SURE_SIGMAS = 2.0  # how far a line is moved aside to see which chords are sure
+_LEAST_SINE = 1e-3  # of the angle at an edge: flatter, the linear law of errors means nothing
+_SPEED_OVER_S = 0.15
 
 
 def true_crossings(
@@ -50,15 +46,19 @@ def true_crossings(
     """Where and when every true line crosses the boundary of the shape.
 
     Args:
-        true_lines: from `fit_lines`; lines without a fit are skipped.
+        true_lines: from `fit_lines`; lines without a fit are skipped. A bow that was measured is followed.
         geometry: the shape in arena cm as it lies in the plane of the light sensor, holes and pieces included.
         track: the frames the lines were fitted to. With them a place becomes a time through the robot's own
             progress; without, through a constant speed from the run's start to its end.
 
     Returns:
-        One row a crossing, by line and order of travel: ``line order t_s s_cm entering x_cm y_cm``, s_cm from the
-        run's start. Entering and leaving alternate, so a line has k = rows/2 chords. A point where the line only
-        touches the shape is no crossing. A run that starts or ends inside the shape is closed there.
+        One row a crossing, by line and order of travel: ``line order t_s s_cm entering x_cm y_cm sigma_s_cm sigma_t_s
+        sigma_length_cm sure``, s_cm from the run's start. Entering and leaving alternate, so a line has k = rows/2
+        chords. A point where the line only touches the shape, or an edge that it runs along, is no crossing. A run that
+        starts or ends inside the shape is closed there. ``sigma_s_cm``: error of the place along the run;
+        ``sigma_t_s``: of the time; ``sigma_length_cm``: of the length of the chord that begins or ends here, on both
+        its rows. ``sure``: the chord is still there when the line is moved aside by two of its standard errors, either
+        way. Without the errors' columns of `fit_lines` they are 0, and every chord is sure.
 
     Raises:
         RequestError: the geometry is not a valid polygon.
@@ -70,45 +70,82 @@ def true_crossings(
     >>> true_crossings(line, box(-3, -3, 5, 3))[["line", "order", "s_cm", "entering"]].to_numpy().tolist()
     [[4, 0, 7.0, True], [4, 1, 15.0, False]]
     """
-    if not shapely.is_valid(geometry) or geometry.is_empty:
-        raise RequestError(f"the shape is no valid polygon ({shapely.is_valid_reason(geometry)}); mend it first")
-    ends = np.stack(
-        [
-            np.column_stack([column(true_lines, f"x_{end}_cm"), column(true_lines, f"y_{end}_cm")])
-            for end in ("start", "end")
-        ],
-        axis=1,
-    )
+    _check(geometry)
+    paths = run_paths(true_lines)
     times = np.column_stack([column(true_lines, "t_start_s"), column(true_lines, "t_end_s")])
     numbers = column(true_lines, "line")
-    fitted = np.flatnonzero(np.isfinite(ends).all(axis=(1, 2)))
-    begins, finishes, owner = _lit_stretches(ends[fitted], geometry)
     frames = _frames_by_line(track)
+    edges = _Edges(geometry)
     columns: dict[str, list[NDArray[Any]]] = {name: [np.empty(0, dtype=_kind(name))] for name in TRUE_CROSSINGS}
-    for place in np.unique(owner):
-        row = int(fitted[place])
-        start, end = ends[row]
-        length = float(np.hypot(*(end - start)))
-        s_cm = _merged(begins[owner == place], finishes[owner == place])
-        known_t, known_s = times[row], np.array([0.0, length])
+    for row, path in paths.items():
+        stretches = path.stretches(geometry)
+        if not len(stretches):
+            continue
+        s_cm = stretches.ravel()
+        known_t, known_s, sigma_along = times[row], np.array([0.0, path.length_cm]), 0.0
         run = frames.get(int(numbers[row]))
         if run is not None:
             seen_t, seen_s = place_along(run, true_lines.iloc[row])
             if len(seen_t) >= 2:
-                known_t, known_s = seen_t, seen_s
+                known_t, known_s, sigma_along = seen_t, seen_s, _sigma_along(run)
+        places = path.points(s_cm)
+        # How far a crossing moves along for each cm that the line lies farther to the left.
+        answer = edges.answer(places, path, s_cm)
+        # Where the run ends inside the shape, moving it aside moves nothing.
+        answer[(s_cm <= 0.0) | (s_cm >= path.length_cm)] = 0.0
+        moved = answer[:, None] * path.covariance(s_cm) * answer
+        variance = np.diagonal(moved)
+        chord = np.diagonal(moved)[0::2] + np.diagonal(moved)[1::2] - 2.0 * np.diagonal(moved, 1)[0::2]
+        when = np.interp(s_cm, known_s, known_t)
+        speed = _speed(known_t, known_s, when)
         order = np.arange(len(s_cm))
         columns["line"].append(np.full(len(s_cm), int(numbers[row])))
         columns["order"].append(order)
-        columns["t_s"].append(np.interp(s_cm, known_s, known_t))
+        columns["t_s"].append(when)
         columns["s_cm"].append(s_cm)
         columns["entering"].append(order % 2 == 0)
-        columns["x_cm"].append(start[0] + s_cm / length * (end[0] - start[0]))
-        columns["y_cm"].append(start[1] + s_cm / length * (end[1] - start[1]))
+        columns["x_cm"].append(places[:, 0])
+        columns["y_cm"].append(places[:, 1])
+        columns["sigma_s_cm"].append(np.sqrt(variance))
+        columns["sigma_t_s"].append(np.sqrt(variance + sigma_along**2) / speed)
+        columns["sigma_length_cm"].append(np.repeat(np.sqrt(np.maximum(chord, 0.0)), 2))
+        columns["sure"].append(np.repeat(_sure(path, stretches, geometry), 2))
     return pd.DataFrame({name: np.concatenate(parts) for name, parts in columns.items()})
 
 
+def near_chords(true_lines: pd.DataFrame, geometry: Polygon | MultiPolygon) -> pd.DataFrame:
+    """Chords that are not there, but would be if a line lay two of its standard errors to one side.
+
+    Args:
+        true_lines: from `fit_lines`, with the errors' columns; without them there are none.
+        geometry: as for `true_crossings`.
+
+    Returns:
+        One row a chord: ``line s_in_cm s_out_cm``.
+
+    Raises:
+        RequestError: the geometry is not a valid polygon.
+        TrackError: a column is missing.
+    """
+    _check(geometry)
+    numbers = column(true_lines, "line")
+    rows: list[tuple[int, float, float]] = []
+    for row, path in run_paths(true_lines).items():
+        here = path.stretches(geometry)
+        for sigmas in (-_SURE_SIGMAS, _SURE_SIGMAS):
+            aside = path.stretches(geometry, sigmas)
+            new = ~_overlapping(aside, here)
+            rows += [(int(numbers[row]), float(begin), float(end)) for begin, end in aside[new]]
+    return pd.DataFrame(rows, columns=list(NEAR_CHORDS)).astype({"line": "int64"})
+
+
+def _check(geometry: Polygon | MultiPolygon) -> None:
+    if not shapely.is_valid(geometry) or geometry.is_empty:
+        raise RequestError(f"the shape is no valid polygon ({shapely.is_valid_reason(geometry)}); mend it first")
+
+
 def _kind(name: str) -> type:
-    return {"line": np.int64, "order": np.int64, "entering": np.bool_}.get(name, np.float64)
+    return {"line": np.int64, "order": np.int64, "entering": np.bool_, "sure": np.bool_}.get(name, np.float64)
 
 
 def _frames_by_line(track: pd.DataFrame | None) -> dict[int, pd.DataFrame]:
@@ -119,194 +156,57 @@ def _frames_by_line(track: pd.DataFrame | None) -> dict[int, pd.DataFrame]:
     return {int(n): track[number == n] for n in np.unique(number[number >= 0])}
 
 
-def _lit_stretches(ends_cm: Floats, geometry: Polygon | MultiPolygon) -> tuple[Floats, Floats, NDArray[np.intp]]:
-    """Begin and end (m,) along its run of every stretch of the runs (n, 2, 2) inside the shape, and whose it is."""
-    start, along = ends_cm[:, 0], ends_cm[:, 1] - ends_cm[:, 0]
-    along = along / np.hypot(along[:, 0], along[:, 1])[:, None]
-    lit = np.asarray(shapely.intersection(shapely.linestrings(ends_cm), geometry), dtype=object)
-    parts, owner = shapely.get_parts(lit, return_index=True)
-    filled = ~np.asarray(shapely.is_empty(parts), dtype=bool)
-    parts, owner = parts[filled], owner[filled]
-    points, part = shapely.get_coordinates(parts, return_index=True)
-    run = owner[part]
-    place = ((points - start[run]) * along[run]).sum(axis=1)
-    begins, finishes = np.full(len(owner), np.inf), np.full(len(owner), -np.inf)
-    np.minimum.at(begins, part, place)
-    np.maximum.at(finishes, part, place)
-    middle = start[owner] + ((begins + finishes) / 2)[:, None] * along[owner]
-    # a touched corner comes back as a point, an edge the run lies on as a stretch with its middle on the boundary
-    inside = np.asarray(shapely.contains_properly(geometry, shapely.points(middle)), dtype=bool)
-    kept = inside & (finishes - begins > _TOUCHING_CM)
-    return begins[kept], finishes[kept], np.asarray(owner[kept], dtype=np.intp)
+def _sigma_along(run: pd.DataFrame) -> float:
+    """Error of the place along the run in cm, that of a smoothed position; 0 where the track does not tell."""
+    if "sigma_x_cm" not in run.columns or "sigma_y_cm" not in run.columns:
+        return 0.0
+    variance = (column(run, "sigma_x_cm") ** 2 + column(run, "sigma_y_cm") ** 2) / 2.0
+    return float(np.sqrt(np.nanmedian(variance))) if np.isfinite(variance).any() else 0.0
 
 
-def _merged(begins: Floats, finishes: Floats) -> Floats:
-    """Ends of the lit stretches in order, where stretches that meet in a point are one."""
-    order = np.argsort(begins)
-    begins, finishes = begins[order], finishes[order]
-    apart = begins[1:] - finishes[:-1] > _TOUCHING_CM
-    kept = np.column_stack([begins[np.concatenate([[True], apart])], finishes[np.concatenate([apart, [True]])]])
-    return np.asarray(kept.ravel(), dtype=float)
+def _speed(known_t: Floats, known_s: Floats, when: Floats) -> Floats:
+    """Speed in cm/s around the instants ``when`` (m,)."""
+    early = np.clip(when - _SPEED_OVER_S, known_t[0], known_t[-1])
+    late = np.clip(when + _SPEED_OVER_S, known_t[0], known_t[-1])
+    way = np.interp(late, known_t, known_s) - np.interp(early, known_t, known_s)
+    return np.maximum(way, 1e-6) / np.maximum(late - early, 1e-9)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ChordMatch:
-    """The robot's chords against the true ones.
+class _Edges:
+    """The straight parts of a shape's boundary, found by place."""
 
-    ``bias_cm``, ``sd_cm`` and ``rms_cm`` are of robot minus true length over the matched chords, ``limits_cm`` the
-    limits of agreement, bias +- 1.96 sd (Bland and Altman 1986). ``scale`` is the slope of robot on true
-    length with its standard error, ``offset_cm`` the median over the chords of camera minus scaled robot
-    distance along the run, ``offset_s`` the median of robot minus true crossing time and ``jitter_s``
-    its spread (1.4826 MAD). What could not be measured is NaN.
+    def __init__(self, geometry: Polygon | MultiPolygon) -> None:
+        ends: list[Floats] = []
+        for ring in shapely.get_rings(shapely.get_parts(geometry)):
+            corners = shapely.get_coordinates(ring)
+            ends.append(np.stack([corners[:-1], corners[1:]], axis=1))
+        parts = np.concatenate(ends)
+        parts = parts[np.hypot(*(parts[:, 1] - parts[:, 0]).T) > 0.0]
+        self._tree = shapely.STRtree(list(np.atleast_1d(np.asarray(shapely.linestrings(parts), dtype=object))))
+        way = parts[:, 1] - parts[:, 0]
+        self._along = way / np.hypot(way[:, 0], way[:, 1])[:, None]
 
-    ``pairs``: one row a matched chord, ``line robot_length_cm true_length_cm difference_cm mean_length_cm
-    robot_centre_cm true_centre_cm x_cm y_cm offset_cm overlap``; the robot's centre is moved to the camera's scale
-    and origin, lengths are as measured, (x, y) is the true centre.
-    """
-
-    lines: int
-    matched: int
-    missed: int
-    extra: int
-    bias_cm: float
-    sd_cm: float
-    rms_cm: float
-    limits_cm: tuple[float, float]
-    scale: float
-    scale_sigma: float
-    offset_cm: float
-    offset_s: float
-    jitter_s: float
-    pairs: pd.DataFrame
-
-    def to_dict(self) -> dict[str, Any]:
-        """The JSON form, without the pairs; NaN becomes None."""
-        values: dict[str, Any] = {name: getattr(self, name) for name in self.__slots__ if name != "pairs"}
-        values["limits_cm"] = [_known(limit) for limit in self.limits_cm]
-        return {name: _known(value) if isinstance(value, float) else value for name, value in values.items()}
+    def answer(self, places_cm: Floats, path: RunPath, s_cm: Floats) -> Floats:
+        """Cm along the run that crossings (m, 2) move for each cm that the path moves left: cot of the angle there."""
+        edge = self._along[np.asarray(self._tree.nearest(shapely.points(places_cm)))]
+        slant = np.arctan(path.slant(s_cm))
+        forward = np.cos(slant)[:, None] * path.along + np.sin(slant)[:, None] * path.left
+        across = edge[:, 1] * forward[:, 0] - edge[:, 0] * forward[:, 1]
+        with_it = (edge * forward).sum(axis=1)
+        flat = np.abs(across) < _LEAST_SINE
+        across = np.where(flat, np.where(across < 0.0, -_LEAST_SINE, _LEAST_SINE), across)
+        return with_it / across
 
 
-def _known(value: float) -> float | None:
-    return value if np.isfinite(value) else None
+def _overlapping(some: Floats, others: Floats) -> NDArray[np.bool_]:
+    """Whether each stretch (m, 2) shares a part with one of the others (n, 2)."""
+    shared = (some[:, None, 0] < others[:, 1]) & (others[:, 0] < some[:, None, 1])
+    return np.asarray(shared.any(axis=1), dtype=np.bool_)
 
 
-def _centres(chords: pd.DataFrame) -> Floats:
-    return (column(chords, "s_in_cm") + column(chords, "s_out_cm")) / 2
-
-
-def _slope(true_cm: Floats, robot_cm: Floats) -> tuple[float, float]:
-    """Slope of robot on true length with its standard error, gross mismatches left out; NaN where undetermined.
-
-    The intercept stays free: threshold and footprint add the same to every chord and are no scale.
-    """
-    half = len(true_cm) // 2
-    if len(true_cm) < _FEWEST_FOR_SCALE or float(np.std(true_cm)) < MARGIN_CM:
-        return np.nan, np.nan
-    # Theil's incomplete method: slopes across half the range of lengths, safe from a few merged chords
-    order = np.argsort(true_cm, kind="stable")
-    x, y = true_cm[order], robot_cm[order]
-    run, rise = x[half:] - x[: len(x) - half], y[half:] - y[: len(y) - half]
-    slope = float(np.median(rise[run > 0] / run[run > 0]))
-    residual = y - slope * x
-    residual -= np.median(residual)
-    used = np.abs(residual) <= max(4 * 1.4826 * float(np.median(np.abs(residual))), 0.1)
-    x, y = x[used] - x[used].mean(), y[used] - y[used].mean()
-    spread = float((x**2).sum())
-    if spread == 0:
-        return np.nan, np.nan
-    slope = float((x * y).sum()) / spread
-    return slope, float(np.sqrt(((y - slope * x) ** 2).sum() / max(len(x) - 2, 1) / spread))
-
-
-def match_crossings(
-    robot: pd.DataFrame,
-    true: pd.DataFrame,
-    *,
-    lines: Iterable[int] | None = None,
-    largest_offset_cm: float = 6.0,
-    fit_scale: bool = True,
-    least_overlap: float = 0.5,
-) -> ChordMatch:
-    """Match the robot's crossings with the true ones, chord by chord.
-
-    The robot counts its way from where it thinks it started. So the chords of each line are first matched with
-    an offset of their own, then once more within 2 cm of the median offset of all chords and, with
-    ``fit_scale``, with the robot's unit of length corrected.
-
-    Args:
-        robot: crossings ``line order s_cm entering`` and, where known, ``t_s``.
-        true: the same from `true_crossings`, with ``x_cm y_cm``.
-        lines: the lines to compare; give those the camera could fit, or chords it had no chance to see
-            count as extra. Default: every line that occurs in either table.
-        largest_offset_cm: how far the two origins of a run may lie apart.
-        fit_scale: let the robot's unit of length differ from the camera's.
-        least_overlap: below this shared part two chords are different chords.
-
-    Raises:
-        TrackError: a column is missing.
-    """
-    tables = [chord_table(robot), chord_table(true)]
-    numbers = np.concatenate([column(table, "line") for table in (robot, true)] if lines is None else [[*lines]])
-    compared = np.unique(numbers).astype(np.int64)
-    robot_chords, true_chords = (table[table["line"].isin(compared)].reset_index(drop=True) for table in tables)
-    length, true_length = column(robot_chords, "length_cm"), column(true_chords, "length_cm")
-
-    def matched(unit: float) -> Alignment:
-        free = align(
-            robot_chords, true_chords, scale=unit, near_cm=0.0, reach_cm=largest_offset_cm, least=least_overlap
-        )
-        near = float(np.median(free.offset_cm)) if len(free.robot) else 0.0
-        reach = min(_SLACK_CM, largest_offset_cm)
-        return align(robot_chords, true_chords, scale=unit, near_cm=near, reach_cm=reach, least=least_overlap)
-
-    unit, best = 1.0, matched(1.0)
-    for _ in range(_SCALE_ROUNDS if fit_scale else 0):
-        slope, _ = _slope(true_length[best.true], length[best.robot])
-        if not abs(slope - 1.0) < _LARGEST_SCALE_ERROR:
-            break
-        # chords that merged can feign a scale: it must explain where the chords lie, too
-        rescaled = matched(slope)
-        if float(rescaled.overlap.sum()) <= float(best.overlap.sum()):
-            break
-        unit, best = slope, rescaled
-    a, b = best.robot, best.true
-    difference = length[a] - true_length[b]
-    late = np.concatenate(
-        [column(robot_chords, name)[a] - column(true_chords, name)[b] for name in ("t_in_s", "t_out_s")]
-    )
-    late = late[np.isfinite(late)]
-    offset_s = float(np.median(late)) if len(late) else np.nan
-    bias = float(difference.mean()) if len(a) else np.nan
-    sd = float(difference.std(ddof=1)) if len(a) > 1 else np.nan
-    slope, slope_sigma = _slope(true_length[b], length[a])
-    return ChordMatch(
-        lines=len(compared),
-        matched=len(a),
-        missed=len(true_chords) - len(a),
-        extra=len(robot_chords) - len(a),
-        bias_cm=bias,
-        sd_cm=sd,
-        rms_cm=float(np.sqrt(np.mean(difference**2))) if len(a) else np.nan,
-        limits_cm=(bias - 1.96 * sd, bias + 1.96 * sd),
-        scale=slope,
-        scale_sigma=slope_sigma,
-        offset_cm=float(np.median(best.offset_cm)) if len(a) else np.nan,
-        offset_s=offset_s,
-        jitter_s=1.4826 * float(np.median(np.abs(late - offset_s))) if len(late) else np.nan,
-        pairs=pd.DataFrame(
-            {
-                "line": column(robot_chords, "line")[a].astype(np.int64),
-                "robot_length_cm": length[a],
-                "true_length_cm": true_length[b],
-                "difference_cm": difference,
-                "mean_length_cm": (length[a] + true_length[b]) / 2,
-                "robot_centre_cm": _centres(robot_chords)[a] / unit + best.offset_cm,
-                "true_centre_cm": _centres(true_chords)[b],
-                "x_cm": column(true_chords, "x_cm")[b],
-                "y_cm": column(true_chords, "y_cm")[b],
-                "offset_cm": best.offset_cm,
-                "overlap": best.overlap,
-            },
-            columns=list(PAIRS),
-        ),
-    )
+def _sure(path: RunPath, stretches: Floats, geometry: Polygon | MultiPolygon) -> NDArray[np.bool_]:
+    """Whether each chord is there wherever the line may lie."""
+    if not path.sigma_beside(stretches.ravel()).any():
+        return np.ones(len(stretches), dtype=bool)
+    right, left = (path.stretches(geometry, sigmas) for sigmas in (-_SURE_SIGMAS, _SURE_SIGMAS))
+    return _overlapping(stretches, right) & _overlapping(stretches, left)

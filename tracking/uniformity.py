@@ -6,7 +6,7 @@ distribution is one call. U lives on a circle (theta = 0 and pi are one directio
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 # Landler, Ruxton, Malkemper, Movement Ecology 7 (2019) 30, after Hermans and Rasson (1985)
 _HERMANS_RASSON = 2.895
-_ORDER = 4
+ORDER = 4
 
 
 def rayleigh(u: ArrayLike) -> Floats:
@@ -63,31 +63,45 @@ def cramer_von_mises(v: ArrayLike) -> Floats:
     return np.asarray(1.0 / (12.0 * n) + ((ordered - place) ** 2).sum(axis=-1), dtype=float)
 
 
-def smooth_means(u: ArrayLike, v: ArrayLike) -> Floats:
-    """The means (..., 14) over the lines of Neyman's orthonormal functions on the square, to total degree 4.
-
-    A function of a line must not depend on which way its normal points: (U + 1, 1 - V) is the same line.
-    So even Legendre polynomials of V go with whole waves of U, cos and sin of 2 pi m U, and odd ones with
-    half waves, cos and sin of pi (2m + 1) U. All have mean 0 and mean square 1 on the square.
-    """
+def _smooth(u: ArrayLike, v: ArrayLike, order: int) -> Iterator[tuple[int, int, Floats]]:
+    """Neyman's functions one by one, each with its number of half waves in U and its degree in V."""
     u_in, v_in = np.broadcast_arrays(np.asarray(u, dtype=float), np.asarray(v, dtype=float))
     height = 2.0 * v_in - 1.0
     legendre = [np.ones_like(height), height]
-    for degree in range(2, _ORDER + 1):
+    for degree in range(2, order + 1):
         legendre.append(((2 * degree - 1) * height * legendre[-1] - (degree - 1) * legendre[-2]) / degree)
     waves = np.exp(1j * np.pi * u_in)
     turning = np.ones_like(waves)
-    means: list[Floats] = []
-    for half_waves in range(_ORDER + 1):
-        for degree in range(half_waves % 2, _ORDER + 1 - half_waves, 2):
+    for half_waves in range(order + 1):
+        for degree in range(half_waves % 2, order + 1 - half_waves, 2):
             norm = np.sqrt((2.0 * degree + 1.0) * (2.0 if half_waves else 1.0))
-            product = (turning * legendre[degree]).mean(axis=-1) * norm
+            product = turning * (legendre[degree] * norm)
             if half_waves or degree:
-                means.append(product.real)
+                yield half_waves, degree, product.real
             if half_waves:
-                means.append(product.imag)
+                yield half_waves, degree, product.imag
         turning = turning * waves
-    return np.stack(means, axis=-1)
+
+
+def smooth_functions(u: ArrayLike, v: ArrayLike, order: int = ORDER) -> Floats:
+    """Neyman's orthonormal functions on the square, to total degree ``order``: (..., n) lines give (..., n, m).
+
+    A function of a line must not depend on which way its normal points: (U + 1, 1 - V) is the same line.
+    So even Legendre polynomials of V go with whole waves of U, cos and sin of 2 pi m U, and odd ones with
+    half waves, cos and sin of pi (2m + 1) U. All have mean 0 and mean square 1 on the square; to degree 4
+    there are 14.
+    """
+    return np.stack([values for *_, values in _smooth(u, v, order)], axis=-1)
+
+
+def smooth_means(u: ArrayLike, v: ArrayLike, order: int = ORDER) -> Floats:
+    """The means (..., m) of `smooth_functions` over the lines (..., n)."""
+    return np.stack([values.mean(axis=-1) for *_, values in _smooth(u, v, order)], axis=-1)
+
+
+def smooth_terms(order: int = ORDER) -> list[tuple[int, int]]:
+    """The half waves in U and the degree in V of each of `smooth_functions`; waves come as cos, sin."""
+    return [(half_waves, degree) for half_waves, degree, _ in _smooth(0.0, 0.0, order)]
 
 
 def neyman(means: Floats, precision: Floats) -> Floats:
@@ -97,6 +111,25 @@ def neyman(means: Floats, precision: Floats) -> Floats:
     degrees of freedom; successive runs share end points, so theirs comes from simulated chains.
     """
     return np.asarray(np.einsum("...i,ij,...j->...", means, precision, means), dtype=float)
+
+
+def hermans_rasson_weights(waves: int) -> Floats:
+    """Weights (waves,) of |sum exp(i m a)|^2 / n, m = 1, 2, ..., in the statistic of Hermans and Rasson.
+
+    From pi/2 - c = (4/pi) sum_odd cos(mc)/m^2 and 2/pi - |sin c| = (4/pi) sum_even cos(mc)/(m^2 - 1).
+    """
+    m = np.arange(1, waves + 1, dtype=float)
+    odd = m % 2 == 1
+    return np.asarray(4.0 / np.pi / np.where(odd, m * m, (m * m - 1.0 + odd) / _HERMANS_RASSON), dtype=float)
+
+
+def cramer_von_mises_weights(waves: int) -> Floats:
+    """Weights (waves,) of |sum cos(j pi V)|^2 / n, j = 1, 2, ..., in the statistic of Cramer and von Mises.
+
+    Its kernel's eigenfunctions are sqrt(2) cos(j pi V), with the eigenvalues 1/(j pi)^2 (Anderson and Darling 1952).
+    """
+    j = np.arange(1, waves + 1, dtype=float)
+    return np.asarray(2.0 / (np.pi * j) ** 2, dtype=float)
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

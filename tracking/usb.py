@@ -19,6 +19,7 @@ from tracking.cameras import CameraError, Frame, check_even
 _log = logging.getLogger(__name__)
 
 _MANUAL_EXPOSURE = 1.0  # V4L2's word for it; 3 is automatic
+_EXPOSURE_HELD = frozenset({1, 2})
 _INTERVALS_KEPT = 30
 
 
@@ -203,7 +204,7 @@ class UsbCamera:
             wishes.append(("exposure time", cv2.CAP_PROP_EXPOSURE, self.settings.exposure))
         if self.settings.focus is not None:
             wishes.append(("focus distance", cv2.CAP_PROP_FOCUS, self.settings.focus))
-        self.not_held = tuple(what for what, number, value in wishes if not capture.set(number, value))
+        self.not_held = tuple(what for what, number, value in wishes if not _holds(capture, number, value))
         if self.not_held:
             _log.warning("%s: the driver does not hold %s; set it by hand", self.name, ", ".join(self.not_held))
 
@@ -276,6 +277,17 @@ class _GapClock:
         self._index += 1 + missed
         self._last_s = t_s
         return self._index, t_s, missed
+
+
+def _holds(capture: Capture, number: int, value: float) -> bool:
+    """Set a property and read it back: many drivers say yes and do nothing."""
+    if not capture.set(number, value):
+        return False
+    kept = capture.get(number)
+    if number == cv2.CAP_PROP_AUTO_EXPOSURE:
+        # V4L2 has two kinds of automatic exposure (0 and 3) and two that hold the time (1 and 2).
+        return round(kept) in _EXPOSURE_HELD
+    return abs(kept - value) <= max(1e-6, 0.1 * abs(value))
 
 
 def _median(values: Sequence[float] | deque[float]) -> float:

@@ -23,6 +23,7 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from lab.base.errors import RequestError
+from tracking.container import Wholeness, wholeness_of
 
 Plane = NDArray[np.uint8]
 
@@ -48,7 +49,8 @@ class VideoInfo:
     ``size`` is (width, height) in pixels of the upright picture, ``rotation_deg`` the counterclockwise
     turn in its metadata (already applied to the frames that are read), ``n_frames`` an estimate (0 =
     unknown, as in a file that was never closed), ``duration_s`` likewise (0.0 = unknown), ``start_s`` the
-    first time stamp.
+    first time stamp, ``stated_frames`` the number in the file's header (0 = none there; an .avi counts
+    empty periods too), ``whole`` what its structure says of its end.
     """
 
     path: Path
@@ -59,6 +61,16 @@ class VideoInfo:
     rotation_deg: int
     start_s: float
     codec: str
+    stated_frames: int
+    whole: Wholeness
+
+
+@dataclass(frozen=True, slots=True)
+class Ending:
+    """How a file ends: ``truncated`` where its end is missing, ``frames_lost`` with it (None: nobody can tell)."""
+
+    truncated: bool
+    frames_lost: int | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,17 +105,20 @@ class FrameReader(Iterator[VideoFrame]):
     """The frames of one file in order of presentation: iterate, or use as a context manager.
 
     ``damage`` is None, or after the last frame one line about what could not be read: a file cut
-    short gives its good frames first and then says so (also as a logged warning).
+    short gives its good frames first and then says so (also as a logged warning). ``truncated`` is
+    then True where its end is missing, and ``frames_lost`` says how many frames there should be
+    more, None where the file does not know (0 where there is no damage).
 
     Args:
         path: the video file.
         threads: decoder threads; 1 where several files are read in parallel processes.
+        quiet: keep damage out of the log, where somebody else reads the same file and says so.
 
     Raises:
         VideoError: the file is missing, empty, no video, or holds no frame that can be decoded.
     """
 
-    def __init__(self, path: str | Path, *, threads: int = 2) -> None:
+    def __init__(self, path: str | Path, *, threads: int = 2, quiet: bool = False) -> None:
         self.path = Path(path)
         self._container, self._stream = _open(self.path)
         self.info = _info(self.path, self._container, self._stream)
@@ -112,8 +127,12 @@ class FrameReader(Iterator[VideoFrame]):
         self._stream.codec_context.thread_count = threads
         self._stream.thread_type = "FRAME"
         self.damage: str | None = None
+        self.truncated = False
+        self.frames_lost: int | None = 0
         self.frames_read = 0
+        self._quiet = quiet
         self._bad_packets = 0
+        self._delay: int | None = None
         self._last_s = self.info.start_s - 1.0 / self.info.rate_hz
         self._frames = self._decode()
 
@@ -137,6 +156,7 @@ class FrameReader(Iterator[VideoFrame]):
     def seek(self, t_s: float) -> None:
         """Go to the last key frame at or before ``t_s``; frame numbers count on from where they were."""
         base = _time_base(self._stream)
+        self._delay = self._delay or 0
         self._container.seek(int(t_s / base), stream=self._stream, backward=True)
         self._frames.close()
         self._frames = self._decode()
@@ -147,6 +167,9 @@ class FrameReader(Iterator[VideoFrame]):
         while True:
             try:
                 packet = next(packets)
+                if packet.is_corrupt:  # the file ends in the middle of it
+                    self._bad_packets += 1
+                    continue
                 decoded = packet.decode()
             except StopIteration:
                 break
@@ -161,47 +184,73 @@ class FrameReader(Iterator[VideoFrame]):
         self._judge(cut)
 
     def _frame(self, decoded: av.VideoFrame) -> VideoFrame:
-        if decoded.format.name not in _LUMA_FIRST:
-            pts, base = decoded.pts, decoded.time_base
-            turned = decoded.rotation
-            decoded_420 = decoded.reformat(format="yuv420p")
-            decoded_420.pts, decoded_420.time_base = pts, base
-        else:
-            turned = decoded.rotation
-            decoded_420 = decoded
-        if decoded.pts is None:
-            t_s = self._last_s + 1.0 / self.info.rate_hz
-        else:
-            base = decoded.time_base or self._stream.time_base or Fraction(1)
-            t_s = decoded.pts * base.numerator / base.denominator
+        t_s, turned = self._time_of(decoded), decoded.rotation
+        decoded_420 = decoded if decoded.format.name in _LUMA_FIRST else decoded.reformat(format="yuv420p")
         self._last_s = t_s
         turns = _quarter_turns(turned)
         frame = VideoFrame(self.frames_read, t_s, _upright(_plane(decoded_420, 0), turns), decoded_420, turns)
         self.frames_read += 1
         return frame
 
+    def _time_of(self, decoded: av.VideoFrame) -> float:
+        ticks = decoded.pts
+        if self.info.whole.counts_periods:
+            # An AVI has no PTS: its frames stand one in each period in the order in which they are decoded, those that
+            # are shown a constant number of periods later.
+            ticks = decoded.dts
+            if ticks is not None and self._delay is None:
+                self._delay = ticks - (self._stream.start_time or 0) if self.frames_read == 0 else 0
+            ticks = None if ticks is None else ticks - (self._delay or 0)
+        if ticks is None:
+            return self._last_s + 1.0 / self.info.rate_hz
+        base = decoded.time_base or self._stream.time_base or Fraction(1)
+        return ticks * base.numerator / base.denominator
+
     def _judge(self, cut: str) -> None:
         """Say what was lost, at the end of the file."""
         if self.frames_read == 0:
-            raise VideoError(self.path, f"{self.path}: not one frame can be decoded; the file is damaged or empty")
-        frame_s = 1.0 / self.info.rate_hz
-        end_s = self.info.start_s + self.info.duration_s
+            raise VideoError(self.path, f"{self.path}: not one frame can be decoded; copy the file or film it again")
+        ending = ending_of(self.info, self.frames_read, self._last_s)
+        self.truncated, self.frames_lost = ending.truncated or bool(cut), ending.frames_lost
+        if not self.truncated:
+            self.frames_lost = self._bad_packets
+        if not self.truncated and not self._bad_packets:
+            return
+        good = f"{self.frames_read} frames are good" + (f", {self.frames_lost} are lost" if self.frames_lost else "")
         if cut:
-            self.damage = f"reading stopped after {self.frames_read} frames: {cut}"
-        elif self._bad_packets:
-            self.damage = f"{self._bad_packets} packets could not be decoded; {self.frames_read} frames are good"
-        elif self.info.duration_s == 0.0 and "matroska" in self._container.format.name:
-            self.damage = f"the file was never closed; {self.frames_read} frames are good"
-        # The stated duration counts the last frame's own length, and is rounded: allow two frames.
-        elif self._last_s + 3.0 * frame_s < end_s and self._last_s + 0.05 < end_s - 2.0 * frame_s:
-            self.damage = f"cut short at {self._last_s:.3f} s of {end_s:.3f} s; {self.frames_read} frames are good"
-        if self.damage:
+            self.damage = f"reading stopped after {self._last_s:.3f} s: {cut}; {good}"
+        elif not self.info.whole.closed:
+            self.damage = f"the file was never closed; {good}"
+        elif self.truncated:
+            self.damage = f"the file is cut short at {self._last_s:.3f} s; {good}"
+        else:
+            self.damage = f"{self._bad_packets} packets could not be decoded; {good}"
+        if not self._quiet:
             _log.warning("%s: %s", self.path, self.damage)
 
 
-def read_frames(path: str | Path, *, threads: int = 2) -> FrameReader:
+def ending_of(info: VideoInfo, frames_read: int, last_s: float) -> Ending:
+    """Judge a file's end by what it says of itself and what it gave: ``frames_read`` frames, the last at ``last_s``."""
+    end_s = info.start_s + info.duration_s
+    if info.whole.known:
+        truncated = not info.whole.is_whole
+    else:
+        # The stated duration counts the last frame's own length, and is rounded: allow two frames.
+        truncated = last_s + max(3.0 / info.rate_hz, 0.05 + 2.0 / info.rate_hz) < end_s
+    if not truncated:
+        return Ending(False, 0)
+    if info.whole.fragmented or not info.whole.closed or not (info.stated_frames or info.duration_s):
+        return Ending(True, None)
+    if info.stated_frames and not info.whole.counts_periods:
+        return Ending(True, max(0, info.stated_frames - frames_read))
+    if info.stated_frames:
+        return Ending(True, max(0, info.stated_frames - 1 - round((last_s - info.start_s) * info.rate_hz)))
+    return Ending(True, max(0, round((end_s - last_s) * info.rate_hz) - 1))
+
+
+def read_frames(path: str | Path, *, threads: int = 2, quiet: bool = False) -> FrameReader:
     """Open a video and iterate over its frames; see FrameReader for errors and for files cut short."""
-    return FrameReader(path, threads=threads)
+    return FrameReader(path, threads=threads, quiet=quiet)
 
 
 def probe(path: str | Path) -> VideoInfo:
@@ -224,7 +273,7 @@ def sample_frames(path: str | Path, count: int = 15) -> list[VideoFrame]:
     Raises:
         VideoError: as ``read_frames``.
     """
-    with FrameReader(path) as reader:
+    with FrameReader(path, quiet=True) as reader:
         total = reader.info.n_frames
         if not 0 < total <= _PLAY_THROUGH_FRAMES and reader.info.duration_s > 0.0:
             return _sought(reader, count)
@@ -264,7 +313,8 @@ def _open(path: Path) -> tuple[InputContainer, VideoStream]:
     try:
         container = av.open(str(path), mode="r")
     except FFmpegError as error:
-        hint = "an mp4 cut short cannot be read at all" if path.suffix.lower() in {".mp4", ".mov"} else "is it a video?"
+        is_mp4 = path.suffix.lower() in {".mp4", ".mov", ".m4v"}
+        hint = "an mp4 cut short cannot be read at all, film in .mkv" if is_mp4 else "give a video, or copy it again"
         raise VideoError(path, f"{path}: cannot be read as a video ({error.strerror}); {hint}") from error
     if not container.streams.video:
         container.close()
@@ -290,6 +340,8 @@ def _info(path: Path, container: InputContainer, stream: VideoStream) -> VideoIn
         rotation_deg=rotation,
         start_s=0.0 if start is None else start * _time_base(stream),
         codec=stream.codec_context.name,
+        stated_frames=stream.frames,
+        whole=wholeness_of(path),
     )
 
 
@@ -338,5 +390,4 @@ def _plane(frame: av.VideoFrame, number: int) -> Plane:
     """One plane as (rows, columns) without the padding of its lines; a view, nothing is copied."""
     plane = frame.planes[number]
     buffer = cast("memoryview[int]", plane)  # a plane speaks the buffer protocol; the stubs do not say so
-    lines: Plane = np.frombuffer(buffer, dtype=np.uint8).reshape(-1, plane.line_size)
-    return lines[: plane.height, : plane.width]
+    return np.ndarray((plane.height, plane.width), np.uint8, buffer, strides=(plane.line_size, 1))

@@ -2,60 +2,77 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from lab.base.errors import RequestError
 from lab.cli.output import JsonFlag, emit, progress_bar, say
+from lab.filmtrack import check_outputs, preview_films, save_table, summary_of, track_films
 from tracking.calibration import load_calibration
-from tracking.overlay import write_preview
-from tracking.track import track_video
+from tracking.innovations import filter_health
 
 
 def track(
-    video: Annotated[Path, typer.Argument(metavar="VIDEO", help="Any video of rolling robots.")],
+    videos: Annotated[
+        list[Path],
+        typer.Argument(metavar="VIDEO...", help="A video of rolling robots, or segments of one still camera."),
+    ],
     calibration: Annotated[
         Path | None, typer.Option(help="calibration.json of the camera; without one, pixels only.")
     ] = None,
     robots: Annotated[int, typer.Option(min=1, max=32, help="How many robots to follow.")] = 1,
+    balls: Annotated[bool, typer.Option("--balls", help="LEDs are off: follow the balls themselves.")] = False,
+    workers: Annotated[int, typer.Option(min=1, help="Processes that share several segments.")] = 2,
     out: Annotated[Path, typer.Option(help="The table: .parquet, or .csv.")] = Path("track.parquet"),
-    preview: Annotated[Path | None, typer.Option(help="Also draw track and LED over the video (.mkv).")] = None,
+    preview: Annotated[Path | None, typer.Option(help="Also draw track and LED over the video: .mkv, or .mp4.")] = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Follow the LEDs through a video: one row a frame (and robot).
 
     Example: chordlab track video.mkv --calibration calibration.json --out track.parquet
     """
-    if out.suffix not in (".parquet", ".csv"):
-        raise RequestError(f"{out}: the table is written as .parquet or .csv; name it so")
+    check_outputs(out, preview)
     optics = load_calibration(calibration) if calibration else None
-    with progress_bar("frames", quiet=as_json) as update:
-        table = track_video(video, calibration=optics, robots=robots, progress=update)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    if out.suffix == ".csv":
-        table.to_csv(out, index=False)
-    else:
-        table.to_parquet(out, index=False)
+    with progress_bar("frames" if len(videos) == 1 else "tracking", quiet=as_json) as update:
+        table, figures = track_films(videos, optics, robots=robots, balls=balls, workers=workers, progress=update)
+    save_table(table, out)
     if preview is not None:
-        write_preview(video, table, preview)
-    seen = table[["x_px", "y_px"]].notna().all(axis=1)
-    summary = {
-        "frames": int(table["frame"].nunique()),
-        "robots": robots,
-        "seen_share": float(seen.mean()) if len(table) else 0.0,
-        "lit_share": float(table["led_on"].mean()) if len(table) else 0.0,
-        "out": out,
-        "preview": preview,
-    }
+        with progress_bar("preview", quiet=as_json) as update:
+            preview_films(videos, table, preview, update)
+    summary = summary_of(figures)
+    health = filter_health(table) if optics is not None else None
     if as_json:
-        emit(summary)
+        emit(
+            {
+                **summary,
+                "robots": robots,
+                "filter": None if health is None else health.to_dict(),
+                "out": out,
+                "preview": preview,
+                "videos": [asdict(film) for film in figures],
+            }
+        )
         return
-    say(
-        f"{summary['frames']} frames, {robots} robot{'s' if robots > 1 else ''}: "
-        f"seen in {summary['seen_share']:.1%}, lit in {summary['lit_share']:.1%} of rows"
-    )
+    say(_line(summary, robots))
+    if health is not None:
+        say(health.verdict)
     for written in (out, preview):
         if written is not None:
             say(str(written))
+
+
+def _line(summary: dict[str, Any], robots: int) -> str:
+    """The result in one line; what did not happen is not mentioned."""
+    text = (
+        f"{summary['frames']} frames at {summary['rate_hz']:.1f} Hz, {robots} robot{'s' if robots > 1 else ''}: "
+        f"seen in {summary['seen_share']:.1%}, lit in {summary['lit_share']:.1%} of rows; {summary['dropped']} dropped"
+    )
+    for key, name in (("duplicated", "stamped twice"), ("frozen", "frozen")):
+        if summary[key]:
+            text += f", {summary[key]} {name}"
+    if summary["truncated"]:
+        lost = summary["frames_lost"]
+        text += "; cut short" if lost is None else f"; cut short, {lost} lost"
+    return text

@@ -140,10 +140,13 @@ def test_a_file_camera_stopped_while_it_waits(clip):
 class Device:
     """Stands for cv2.VideoCapture: gives frames with the stamps of a script, then blocks or fails."""
 
-    def __init__(self, stamps_ms, *, opened=True, refuses=(), size=(64, 48), then_fails=False, bad=(), wait_s=0.001):
+    def __init__(
+        self, stamps_ms, *, opened=True, refuses=(), size=(64, 48), then_fails=False, bad=(), wait_s=0.001, keeps=()
+    ):
         self.stamps = list(stamps_ms)
         self.opened, self.refuses, self.size, self.then_fails, self.bad = opened, refuses, size, then_fails, bad
         self.wait_s, self.at, self.released, self.asked = wait_s, -2, False, {}
+        self.keeps = dict(keeps)
         self.more = threading.Event()
 
     def isOpened(self):
@@ -156,6 +159,8 @@ class Device:
     def get(self, prop):
         if prop == cv2.CAP_PROP_FPS:
             return 30.0
+        if prop in self.asked and prop != cv2.CAP_PROP_POS_MSEC:
+            return self.keeps.get(prop, self.asked[prop])
         return float(self.stamps[min(max(self.at, 0), len(self.stamps) - 1)])
 
     def grab(self):
@@ -246,6 +251,17 @@ def test_what_the_driver_will_not_hold_is_warned_of(caplog):
     assert "does not hold focus, exposure time" in caplog.text
     assert "64x48 pixels instead of 32x24" in caplog.text
     assert camera.size == (64, 48)
+
+
+def test_a_driver_that_says_yes_and_does_nothing_is_found_out():
+    """Read back: aperture priority (3) is automatic exposure, shutter priority (2) is not; a focus that stays away."""
+    settings = UsbSettings(size=(64, 48), focus=10.0, timeout_s=2.0)
+    lying = {cv2.CAP_PROP_AUTO_EXPOSURE: 3.0, cv2.CAP_PROP_AUTOFOCUS: 1.0, cv2.CAP_PROP_FOCUS: 250.0}
+    camera, _ = film(Device([1.0, 34.0], keeps=lying), 2, settings)
+    assert camera.not_held == ("exposure", "focus", "focus distance")
+    honest = {cv2.CAP_PROP_AUTO_EXPOSURE: 2.0, cv2.CAP_PROP_FOCUS: 10.5}
+    camera, _ = film(Device([1.0, 34.0], keeps=honest), 2, settings)
+    assert camera.not_held == ()
 
 
 def test_a_frame_that_cannot_be_decoded_is_counted():

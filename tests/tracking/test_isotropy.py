@@ -5,84 +5,42 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 from shapely import LineString, MultiPoint, Point, Polygon, box
 
 from lab.base.errors import RequestError
+from tests.tracking.rolled_lines import (
+    ARENA,
+    DISC,
+    OBLIQUE,
+    billiard,
+    chained,
+    disc,
+    ends_of,
+    lines_through,
+    place,
+    rates,
+    sums_of,
+    thrown,
+    thrown_at_arena,
+    thrown_at_disc,
+)
 from tracking.isotropy import TooFewLinesError, examine_lines, tabulate
-from tracking.linespace import LineSpace, RegionError, corners, roll, support, uniforms
-from tracking.uniformity import cramer_von_mises, hermans_rasson, holm, neyman, rayleigh, smooth_means
-
-ARENA = box(-60, -45, 60, 45)
-OBLIQUE = Polygon([(-40, -20), (30, -35), (55, 5), (10, 40), (-25, 30)])
-
-
-def billiard(width, height, chains, runs, rng, uniform_angle=False, skip=30):
-    """Rectangle billiards by reflection-free axis-wise ray casting: none of the package's geometry."""
-    half = np.array([width / 2, height / 2])
-    x = np.column_stack([rng.uniform(-half[0], half[0], chains), np.full(chains, -half[1])])
-    inward = np.tile([0.0, 1.0], (chains, 1))
-    points = [x]
-    for _ in range(runs + skip):
-        phi = (rng.random(chains) - 0.5) * np.pi if uniform_angle else np.arcsin(2 * rng.random(chains) - 1)
-        c, s = np.cos(phi), np.sin(phi)
-        d = np.column_stack([inward[:, 0] * c - inward[:, 1] * s, inward[:, 0] * s + inward[:, 1] * c])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            reach = np.where(np.abs(d) > 1e-12, (np.sign(d) * half - x) / d, np.inf)
-        axis = reach.argmin(axis=1)
-        x = x + reach.min(axis=1)[:, None] * d
-        rows = np.arange(chains)
-        x[rows, axis] = np.sign(d[rows, axis]) * half[axis]
-        inward = np.zeros_like(d)
-        inward[rows, axis] = -np.sign(d[rows, axis])
-        points.append(x)
-    return lines_through(np.stack(points[skip:], axis=1))
-
-
-def lines_through(points):
-    """(theta, p, length) of the legs of paths (chains, n + 1, 2)."""
-    leg = np.diff(points, axis=1)
-    theta = np.arctan2(leg[..., 0], -leg[..., 1])
-    p = points[:, :-1, 0] * np.cos(theta) + points[:, :-1, 1] * np.sin(theta)
-    turn = np.floor(theta / np.pi)
-    return theta - turn * np.pi, np.where(turn == 0, p, -p), np.hypot(leg[..., 0], leg[..., 1])
-
-
-def thrown(region, n, rng):
-    """Lines thrown at the circumscribed disc, those that miss the region dropped: isotropic by definition."""
-    radius = max(np.hypot(*np.transpose(region.exterior.coords)))
-    theta, p = rng.uniform(0, np.pi, 4 * n), rng.uniform(-radius, radius, 4 * n)
-    foot = np.column_stack([p * np.cos(theta), p * np.sin(theta)])
-    along = np.column_stack([-np.sin(theta), np.cos(theta)]) * 3 * radius
-    chords = shapely.intersection(shapely.linestrings(np.stack([foot - along, foot + along], axis=1)), region)
-    hit = shapely.length(chords) > 0
-    return theta[hit][:n], p[hit][:n], shapely.length(chords)[hit][:n]
-
-
-def place(density, peak, chains, n, rng):
-    """Points (U, V) of a density by rejection, mapped back to lines of the arena."""
-    u, v = rng.random((2, chains, 4 * n))
-    first = np.argsort(density(u, v) / peak < rng.random(u.shape), axis=1, kind="stable")[:, :n]
-    return np.take_along_axis(u, first, 1), np.take_along_axis(v, first, 1)
-
-
-def rates(null, u, v):
-    """Share of rows that each test rejects at 5 %."""
-    found = {
-        "rayleigh": rayleigh(u),
-        "hermans_rasson": hermans_rasson(u),
-        "cramer_von_mises": cramer_von_mises(v),
-        "neyman": neyman(smooth_means(u, v), null.precision),
-    }
-    return {name: float(np.mean([null.p_value(name, s) < 0.05 for s in values])) for name, values in found.items()}
+from tracking.linespace import LineSpace, RegionError, Wall, corners, roll, support, uniforms
+from tracking.nulltable import Sums
+from tracking.uniformity import cramer_von_mises, holm, neyman, rayleigh, smooth_means
 
 
 @pytest.fixture(scope="module")
 def null():
     return tabulate(ARENA, 200, np.random.default_rng(11), sessions=3999)
+
+
+@pytest.fixture(scope="module")
+def null_afresh():
+    return tabulate(ARENA, 200, np.random.default_rng(12), sessions=3999, successive=False)
 
 
 # --- the space of lines
@@ -142,6 +100,15 @@ def test_isotropic_lines_are_uniform_on_the_square():
     assert stats.kstest(theta / np.pi, "uniform").pvalue < 1e-3
 
 
+def test_ends_of_lines_on_the_wall():
+    for region in (ARENA, OBLIQUE, DISC):
+        rolls = roll(region, 1, 200, np.random.default_rng(2))
+        found = Wall.of(region).ends_cm(rolls.theta_rad[0], rolls.p_cm[0])
+        np.testing.assert_allclose(
+            np.sort(found, axis=1), np.sort(np.column_stack([rolls.start_cm[0], rolls.end_cm[0]]), axis=1), atol=1e-6
+        )
+
+
 # --- the rolls
 
 
@@ -173,82 +140,49 @@ def test_rolls_follow_the_law_of_an_independent_billiard():
     assert follow[0] == pytest.approx(follow[1], abs=0.01)
 
 
-# --- the statistics
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.integers(2, 60), st.integers(0, 2**32 - 1))
-def test_hermans_rasson_is_the_sum_over_all_pairs(n, seed):
-    u = np.random.default_rng(seed).random((3, n)).round(2)  # ties too
-    angle = 2 * np.pi * u
-    apart = np.abs(angle[:, :, None] - angle[:, None, :])
-    terms = np.abs(np.pi - apart) - np.pi / 2 - 2.895 * (np.abs(np.sin(apart)) - 2 / np.pi)
-    np.testing.assert_allclose(hermans_rasson(u), terms.sum(axis=(1, 2)) / n, atol=1e-9)
-
-
-def test_statistics_against_closed_forms():
-    v = np.random.default_rng(8).random(83)
-    assert cramer_von_mises(v) == pytest.approx(stats.cramervonmises(v, "uniform").statistic)
-    assert rayleigh(np.full(7, 0.3)) == pytest.approx(14.0)
-    assert rayleigh(np.arange(8) / 8) == pytest.approx(0.0)
-    assert holm([0.04, 0.01, 0.03, 0.9]) == pytest.approx([0.09, 0.04, 0.09, 0.9])
-
-
-def test_smooth_functions_are_orthonormal_and_blind_to_the_sense_of_the_normal():
-    nodes, weights = np.polynomial.legendre.leggauss(24)
-    u, v = (grid.ravel() for grid in np.meshgrid((nodes + 1) / 2, (nodes + 1) / 2))
-    weight = np.outer(weights, weights).ravel() / 4
-    # rows of one point each are the functions themselves
-    functions = smooth_means(u[:, None], v[:, None])
-    assert functions.shape[1] == 14
-    np.testing.assert_allclose(functions.T @ (functions * weight[:, None]), np.eye(14), atol=1e-9)
-    np.testing.assert_allclose(weight @ functions, 0, atol=1e-9)
-    np.testing.assert_allclose(smooth_means(u[:, None] + 1, 1 - v[:, None]), functions, atol=1e-9)
-
-
-def test_neyman_of_independent_lines_is_chi_square():
-    u, v = np.random.default_rng(9).random((2, 2000, 100))
-    statistic = neyman(smooth_means(u, v), 100 * np.eye(14))
-    assert stats.kstest(statistic, stats.chi2(14).cdf).pvalue > 1e-3
-
-
 # --- false alarms and power
 
 
 def test_false_alarms_of_perfect_sessions(null):
     theta, p, length = billiard(120, 90, 1000, 200, np.random.default_rng(20))
-    u, v = uniforms(theta, p, ARENA)
-    for name, rate in rates(null, u, v).items():
+    for name, rate in rates(null, sums_of(null, theta, p, length, ends_of(theta, p, ARENA))).items():
         assert 0.03 < rate < 0.075, name
     rng = np.random.default_rng(21)
-    reports = [examine_lines(*rows, ARENA, rng, null=null) for rows in zip(theta[:300], p[:300], length, strict=False)]
-    assert np.mean([not report.passed for report in reports]) < 0.08
+    reports = [examine_lines(*rows, ARENA, rng, null=null) for rows in zip(theta[:200], p[:200], length, strict=False)]
+    assert np.mean([not report.passed for report in reports]) < 0.09
     assert np.mean([report.run_length_p < 0.05 for report in reports]) < 0.09
-    assert np.mean([report.bias_low > 0 for report in reports]) < 0.12
+    assert np.mean([report.bias_low > 0 for report in reports]) < 0.07
+
+
+# the proof in full; the normal run takes a tenth of the sessions
+FULL_SESSIONS = 20000
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
-@pytest.mark.parametrize(("lines", "successive"), [(60, True), (200, True), (200, False), (500, True)])
-def test_false_alarms_are_five_percent(lines, successive):
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("lines", [100, 200, 500])
+@pytest.mark.parametrize("arena", ["rectangle", "disc"])
+@pytest.mark.parametrize("successive", [True, False], ids=["chains", "lines"])
+def test_false_alarms_are_five_percent(arena, lines, successive, full):
+    """2000 sessions of 200 lines; of the other numbers a quarter of that, but for a run with --full."""
+    sessions = FULL_SESSIONS if full else 2000 if lines == 200 else 500
+    region = ARENA if arena == "rectangle" else DISC
     rng = np.random.default_rng(30)
-    sessions, slack = (10000, 0.01) if successive else (1500, 0.022)
-    table = tabulate(ARENA, lines, rng, sessions=9999, successive=successive)
+    simulated = 5000 if full or lines == 200 else 2000
+    table = tabulate(region, lines, rng, sessions=simulated, successive=successive)
     if successive:
-        theta, p, length = billiard(120, 90, sessions, lines, rng)
+        theta, p, length = (
+            billiard(120, 90, sessions, lines, rng) if arena == "rectangle" else disc(sessions, lines, rng)
+        )
+        at = ends_of(theta, p, region)
     else:
-        theta, p, length = (a.reshape(sessions, lines) for a in thrown(ARENA, sessions * lines, rng))
-    for name, rate in rates(table, *uniforms(theta, p, ARENA)).items():
+        throw = thrown_at_arena if arena == "rectangle" else thrown_at_disc
+        theta, p, length = (a.reshape(sessions, lines) for a in throw(sessions * lines, rng))
+        at = None
+    # 0.01, and twice the error of a rate from so many sessions and that of the table's own quantile
+    slack = 0.01 + 2 * np.sqrt(0.05 * 0.95 * (1 / sessions + 1 / simulated)) * (not full)
+    for name, rate in rates(table, sums_of(table, theta, p, length, at)).items():
         assert abs(rate - 0.05) < slack, name
-    reports = [
-        examine_lines(*rows, ARENA, rng, null=table, successive=successive)
-        for rows in zip(theta[:2500], p[:2500], length, strict=False)
-    ]
-    assert abs(np.mean([report.run_length_p < 0.05 for report in reports]) - 0.05) < 0.022
-    # Holm's correction takes no account of what the tests share, and so stays a little below
-    assert 0.03 < np.mean([not report.passed for report in reports]) < 0.055
-    assert 0.02 < np.mean([report.isotropy_p < 0.05 for report in reports]) < 0.06
-    assert 0.03 < np.mean([report.homogeneity_p < 0.05 for report in reports]) < 0.06
 
 
 def test_tests_for_independent_lines_would_condemn_perfect_sessions():
@@ -266,44 +200,74 @@ def test_raw_angles_condemn_perfect_lines():
     assert np.mean(mapped > stats.chi2(2).isf(0.05)) < 0.13
 
 
-def test_power_against_one_axis(null):
-    for phase in (0.0, 0.3):
-        u, v = place(
-            lambda u, v, at=phase: 1 + 0.25 * np.cos(2 * np.pi * (u - at)), 1.25, 500, 200, np.random.default_rng(24)
-        )
-        found = rates(null, u, v)
-        assert found["rayleigh"] > 0.45
-        assert found["hermans_rasson"] > 0.36
+FAULTS = {
+    "axis": (lambda u, v: 1 + 0.25 * np.cos(2 * np.pi * u), 1.25),
+    "oblique axis": (lambda u, v: 1 + 0.25 * np.cos(2 * np.pi * (u - 0.3)), 1.25),
+    "four arms": (lambda u, v: 1 + 0.3 * np.cos(4 * np.pi * u), 1.3),
+    "centre": (lambda u, v: 1 - 0.3 * np.cos(2 * np.pi * v), 1.3),
+}
 
 
-def test_power_against_four_arms(null):
-    u, v = place(lambda u, v: 1 + 0.3 * np.cos(4 * np.pi * u), 1.3, 500, 200, np.random.default_rng(25))
-    found = rates(null, u, v)
-    assert found["hermans_rasson"] > 0.5
-    assert found["rayleigh"] < 0.1
+@pytest.mark.parametrize(
+    ("fault", "least"),
+    [
+        ("axis", {"rayleigh": 0.54, "hermans_rasson": 0.42, "neyman": 0.23}),
+        ("oblique axis", {"rayleigh": 0.54, "hermans_rasson": 0.42, "neyman": 0.23}),
+        ("four arms", {"hermans_rasson": 0.60, "neyman": 0.41}),
+        ("centre", {"cramer_von_mises": 0.24, "neyman": 0.36}),
+    ],
+)
+def test_power_over_independent_lines(null_afresh, fault, least):
+    density, peak = FAULTS[fault]
+    u, v = place(density, peak, 1000, 200, np.random.default_rng(24))
+    sums = Sums.of(u, v, np.full(u.shape, 80.0), null_afresh.ends.total(np.zeros((1000, 1)), np.zeros((1000, 1), bool)))
+    found = rates(null_afresh, sums)
+    assert {name: found[name] for name, power in least.items() if found[name] < power} == {}
+
+
+@pytest.mark.parametrize(
+    ("fault", "least"),
+    [
+        ("axis", {"rayleigh": 0.45, "hermans_rasson": 0.36, "neyman": 0.23}),
+        ("oblique axis", {"rayleigh": 0.54, "hermans_rasson": 0.42, "neyman": 0.28}),
+        ("four arms", {"hermans_rasson": 0.60, "neyman": 0.46}),
+        ("centre", {"cramer_von_mises": 0.25, "neyman": 0.34}),
+    ],
+)
+def test_power_over_chains(null, fault, least):
+    theta, p, length, at = chained(ARENA, *FAULTS[fault], 1000, 200, np.random.default_rng(25))
+    found = rates(null, sums_of(null, theta, p, length, at))
+    assert {name: found[name] for name, power in least.items() if found[name] < power} == {}
+
+
+def test_shared_ends_hide_faults_of_place_from_plain_means(null):
+    """Means from which the common part of shared ends is taken find twice as many pulls to the centre."""
+    theta, p, length, at = chained(ARENA, *FAULTS["centre"], 600, 200, np.random.default_rng(28))
+    freed = rates(null, sums_of(null, theta, p, length, at))["cramer_von_mises"]
+    v = uniforms(theta, p, ARENA)[1]
+    perfect = roll(ARENA, 2000, 200, np.random.default_rng(29))
+    bound = np.quantile(cramer_von_mises(uniforms(perfect.theta_rad, perfect.p_cm, ARENA)[1]), 0.95)
+    assert freed > 1.6 * np.mean(cramer_von_mises(np.clip(v, 0, 1)) > bound)
 
 
 def test_power_against_a_uniform_angle_at_the_wall(null):
     rng = np.random.default_rng(26)
-    theta, p, _ = billiard(120, 90, 500, 200, rng, uniform_angle=True)
-    found = rates(null, *uniforms(theta, p, ARENA))
-    assert found["neyman"] > 0.88
+    theta, p, length = billiard(120, 90, 500, 200, rng, uniform_angle=True)
+    found = rates(null, sums_of(null, theta, p, length, ends_of(theta, p, ARENA)))
+    assert found["neyman"] > 0.92
     assert found["cramer_von_mises"] > 0.56
 
 
 def test_power_against_waypoints(null):
     rng = np.random.default_rng(27)
-    points = np.stack([rng.uniform(-60, 60, (200, 201)), rng.uniform(-45, 45, (200, 201))], axis=-1)
+    points = np.stack([rng.uniform(-60, 60, (50, 201)), rng.uniform(-45, 45, (50, 201))], axis=-1)
     theta, p, length = lines_through(points)
-    found = rates(null, *uniforms(theta, p, ARENA))
-    assert found["neyman"] == 1
-    assert found["cramer_von_mises"] > 0.99
-    assert found["rayleigh"] > 0.85
-    report = examine_lines(theta[0], p[0], length[0], ARENA, rng, null=null)
-    assert not report.passed
-    assert report.homogeneity_p < 0.01
-    assert "not isotropic and homogeneous" in report.verdict
-    assert "cut short" in report.verdict
+    reports = [examine_lines(*row, ARENA, rng, null=null) for row in zip(theta, p, length, strict=True)]
+    assert not any(report.passed for report in reports)
+    assert max(report.homogeneity_p for report in reports) < 0.01
+    assert np.mean([report.isotropy_p < 0.05 for report in reports]) > 0.9
+    assert "not isotropic and homogeneous" in reports[0].verdict
+    assert "cut short" in reports[0].verdict
 
 
 # --- the report
@@ -313,11 +277,13 @@ def test_report_of_a_perfect_session(null):
     theta, p, length = (a[0] for a in billiard(120, 90, 1, 200, np.random.default_rng(40)))
     report = examine_lines(theta, p, length, ARENA, np.random.default_rng(41), null=null)
     assert report.passed
+    assert report.family_p >= 0.05
     assert report.lines == 200
     assert report.outside == 0
     assert report.predicted_run_cm == pytest.approx(np.pi * 120 * 90 / 420)
     assert report.mean_run_cm == pytest.approx(length.mean())
-    assert 0.3 < report.smallest_bias < 0.36
+    assert 0.35 < report.smallest_bias < 0.45
+    assert report.linked == 199
     assert report.bias_low <= report.bias <= report.bias_high
     assert [test.name for test in report.tests] == ["rayleigh", "hermans_rasson", "cramer_von_mises", "neyman"]
     assert [t.holm_p_value for t in report.tests] == pytest.approx(holm([t.p_value for t in report.tests]))
@@ -360,15 +326,15 @@ def test_unusable_lines_are_counted():
 def test_runs_the_camera_cannot_see_are_no_fault():
     """Runs below 12 cm hug the corners; leaving them out here and in the null keeps the level."""
     rng = np.random.default_rng(44)
-    theta, p, length = billiard(120, 90, 300, 260, rng)
+    theta, p, length = billiard(120, 90, 150, 260, rng)
     table = tabulate(ARENA, 200, rng, sessions=1999, shortest_cm=12.0)
     reports = []
     for row in zip(theta, p, length, strict=True):
         kept = row[2] >= 12.0
         reports.append(examine_lines(*(a[kept][:200] for a in row), ARENA, rng, null=table, shortest_cm=12.0))
-    assert np.mean([not report.passed for report in reports]) < 0.08
+    assert np.mean([not report.passed for report in reports]) < 0.11
     assert reports[0].predicted_run_cm > np.pi * 120 * 90 / 420 + 2
-    assert np.mean([report.run_length_p < 0.05 for report in reports]) < 0.09
+    assert np.mean([report.run_length_p < 0.05 for report in reports]) < 0.11
 
 
 def test_requests_that_cannot_be_met(null):
@@ -390,3 +356,32 @@ def test_same_generator_same_report():
     theta, p, length = (a[0] for a in billiard(120, 90, 1, 60, np.random.default_rng(46)))
     reports = [examine_lines(theta, p, length, ARENA, np.random.default_rng(5)) for _ in range(2)]
     assert reports[0] == reports[1]
+
+
+def test_several_robots_each_roll_a_chain_of_their_own():
+    rng = np.random.default_rng(47)
+    two = [a.T.ravel() for a in billiard(120, 90, 2, 60, rng)]
+    names = np.tile(["a", "b"], 60)
+    mixed = examine_lines(*two, ARENA, np.random.default_rng(5), chain=names)
+    assert mixed.linked == 118
+    parted = [np.concatenate([a[names == name] for name in "ab"]) for a in two]
+    assert examine_lines(*parted, ARENA, np.random.default_rng(5), chain=np.sort(names)) == mixed
+    # what the shared ends explain is lost where the chains are not told apart
+    assert examine_lines(*two, ARENA, np.random.default_rng(5)).linked < 30
+
+
+def test_a_lost_run_breaks_the_chain():
+    rng = np.random.default_rng(48)
+    theta, p, length = (a[0] for a in billiard(120, 90, 1, 81, rng))
+    theta[40] = np.nan
+    report = examine_lines(theta, p, length, ARENA, rng)
+    assert (report.lines, report.skipped) == (80, 1)
+    assert report.linked in (78, 79)  # the runs either side may end near each other by chance
+    assert examine_lines(theta, p, length, ARENA, rng, successive=False).linked == 0
+
+
+def test_links_survive_the_cameras_errors():
+    rng = np.random.default_rng(49)
+    theta, p, length = (a[0] for a in billiard(120, 90, 1, 150, rng))
+    noisy = theta + rng.normal(0, 0.003, 150), p + rng.normal(0, 0.15, 150), length
+    assert examine_lines(*noisy, ARENA, rng).linked >= 147

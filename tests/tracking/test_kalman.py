@@ -27,6 +27,7 @@ def test_written_out_recursion_equals_filterpy(n, seed, q):
     x, y = rng.normal(0.0, 20.0, (2, n))
     rx, ry = rng.uniform(1e-4, 0.1, (2, n))
     use = rng.random(n) < 0.8
+    use[n // 3 : n // 2] = False  # and a long one
     use[0] = True
     x[~use] = y[~use] = np.nan
     kicks = np.where(rng.random(n) < 0.1, 1600.0, 0.0)

@@ -95,3 +95,49 @@ def test_no_robot_jumps(track):
     for _, mine in track.groupby("robot"):
         step = np.hypot(mine["x_px"].diff(), mine["y_px"].diff())
         assert step.max() < 20.0
+
+
+def _balls(name, robots):
+    video = FOOTAGE.with_name(f"{name}.mp4")
+    if not video.is_file():
+        pytest.skip(f"no recorded footage at {video}")
+    marks = pd.read_csv(HERE / "data" / f"{name}.csv")
+    return track_video(video, robots=robots, balls=True), marks
+
+
+def _nearest_px(track, marks):
+    found = []
+    for mark in marks.itertuples():
+        here = track[track["frame"] == mark.frame]
+        found.append(np.hypot(here["x_px"] - mark.x_px, here["y_px"] - mark.y_px).min())
+    return np.array(found)
+
+
+def test_balls_with_their_leds_off_are_found_on_mats():
+    track, marks = _balls("bolts-on-mats", 3)
+    assert len(track) == 3 * 902
+    assert not track["led_on"].any()
+    errors = _nearest_px(track, marks)
+    assert np.nanmedian(errors) <= 2.0
+    assert np.mean(errors <= 4.0) >= 0.9
+    assert track["x_px"].notna().mean() > 0.9
+
+
+def test_fast_balls_that_bump_are_found_upright_in_a_rotated_film():
+    track, marks = _balls("minis-rotated", 2)
+    assert len(track) == 2 * 269
+    errors = _nearest_px(track, marks)
+    assert np.nanmedian(errors) <= 2.0
+    # One ball that is half out of the picture.
+    assert np.mean(errors <= 4.0) >= 0.95
+    for _, mine in track.groupby("robot"):
+        step = np.hypot(mine["x_px"].diff(), mine["y_px"].diff())
+        assert step.max() < 40.0  # less than a ball: they never change places
+
+
+def test_forty_frames_are_labelled_by_hand(labels):
+    frames = [labels[labels["what"] == "centre"]["frame"].nunique()]
+    frames += [
+        pd.read_csv(HERE / "data" / f"{name}.csv")["frame"].nunique() for name in ("bolts-on-mats", "minis-rotated")
+    ]
+    assert sum(frames) >= 40

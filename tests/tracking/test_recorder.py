@@ -20,7 +20,7 @@ from lab.clock import run
 from tracking import segment
 from tracking.cameras import CameraError, Frame
 from tracking.recorder import EncoderSettings, Recorder, RecorderError
-from tracking.segment import SegmentWriter, frames_table, part_of
+from tracking.segment import SegmentWriter, frames_table, late_frames, part_of
 from tracking.synthetic import CameraSettings, RobotView
 from tracking.video import read_frames
 from tracking.virtual import VirtualCamera
@@ -440,3 +440,11 @@ def test_without_h264_auto_takes_motion_jpeg(monkeypatch):
     assert EncoderSettings().encoder() == "mjpeg"
     with pytest.raises(RequestError, match="no H"):
         EncoderSettings(codec="h264").encoder()
+
+
+def test_late_is_more_than_half_a_period_after_the_shortest_way():
+    camera = np.arange(6) / 30.0
+    way = np.array([0.080, 0.050, 0.066, 0.068, 0.050, 0.200])
+    assert late_frames(camera, 1000.0 + camera + way, 30.0) == 3
+    assert late_frames(camera, 1000.0 + camera + way, 5.0) == 1
+    assert late_frames([], [], 30.0) == 0

@@ -13,7 +13,8 @@ from lab.base.pinhole import Pinhole
 from tracking.calibration import Calibration, CalibrationError
 from tracking.overlay import draw_frame, write_preview
 from tracking.synthetic import CameraSettings, OverheadScene, RobotView
-from tracking.track import CM_COLUMNS, PIXEL_COLUMNS, track_segments, track_video
+from tracking.table import CM_COLUMNS, PIXEL_COLUMNS
+from tracking.track import track_segments, track_video
 from tracking.video import VideoError, read_frames
 
 SIZE = (640, 360)
@@ -332,8 +333,9 @@ def test_bad_requests_are_named(tmp_path, bounce, session):
         for _ in range(3):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((48, 64), 90, np.uint8), format="gray")))
         container.mux(stream.encode())
-    with pytest.raises(RequestError, match="no colour"):
-        track_video(tmp_path / "grey.avi", robots=2)
+    nothing = track_video(tmp_path / "grey.avi", robots=2)
+    assert len(nothing) == 6
+    assert nothing["x_px"].isna().all()
 
 
 def test_a_stuck_clock_costs_no_row(tmp_path):
@@ -341,15 +343,33 @@ def test_a_stuck_clock_costs_no_row(tmp_path):
     path = roll(times, (-10.0, 0.0), np.array([20.0, 0.0]))
     pictures = draw(path, np.ones(30))
     track = track_video(film(tmp_path / "t.mkv", pictures, times), calibration=CALIBRATION)
-    from tracking.track import _Raw, _table
+    from tracking.passes import RawTrack
+    from tracking.table import track_table
 
-    raw = _Raw(
+    raw = RawTrack(
         np.where(np.arange(30) == 12, times[11], times),
         np.column_stack([track[["x_px", "y_px"]], np.full((30, 2), 0.01)]),
         np.ones(30),
         np.ones(30),
     )
-    table = _table(raw, CALIBRATION)
+    table = track_table(raw, CALIBRATION)
     assert len(table) == 30
     assert table.loc[12, "x_smooth_cm"] == table.loc[11, "x_smooth_cm"]
     assert np.abs(table["x_smooth_cm"] - path[:, 0])[np.arange(30) != 12].max() < 0.2
+
+
+def test_a_picture_shown_twice_tells_the_filter_nothing():
+    """A stamp of its own under the place of the frame before."""
+    from tracking.passes import RawTrack
+    from tracking.table import track_table
+
+    times = np.arange(60) / 30.0
+    path = roll(times, (-10.0, 0.0), np.array([20.0, 0.0]))
+    pixels = OPTICS.project(np.column_stack([path[:, :2], np.full(60, CALIBRATION.led_height_cm)]))
+    shown = np.arange(60)
+    shown[[20, 40]] -= 1
+    raw = RawTrack(times, np.column_stack([pixels[shown], np.full((60, 2), 0.01)]), np.ones(60), np.ones(60))
+    table = track_table(raw, CALIBRATION)
+    assert np.flatnonzero(table["nis"].isna() & (table["frame"] > 1)).tolist() == [20, 40]
+    assert np.abs(table["x_smooth_cm"] - path[:, 0]).max() < 0.02
+    assert np.allclose(table["x_px"], pixels[shown, 0])

@@ -13,8 +13,9 @@ from shapely.affinity import rotate, translate
 from lab.base.errors import RequestError
 from tracking.chords import align, chord_table
 from tracking.linespace import roll
+from tracking.matching import match_crossings
 from tracking.runs import TrackError, fit_lines
-from tracking.truth import TRUE_CROSSINGS, match_crossings, true_crossings
+from tracking.truth import TRUE_CROSSINGS, true_crossings
 
 ARENA = box(-60, -45, 60, 45)
 ANNULUS = Point(5, -4).buffer(20, quad_segs=60).difference(Point(5, -4).buffer(9, quad_segs=60))
