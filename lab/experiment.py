@@ -76,7 +76,7 @@ def run_experiment(
     world_seed, turn_seed = settings.seeds()
     dictionary = dictionary_with(shape, settings)
     say(f"dictionary: {len(dictionary)} entries; learning how each looks to a blind robot")
-    recogniser = recogniser_for(dictionary, settings, progress=_tenths(say))
+    recogniser = recogniser_for(dictionary, settings, called=shape.name, progress=_tenths(say))
     kept = _Kept()
 
     async def on_the_bench() -> None:
@@ -176,8 +176,12 @@ def _manifest(
         "devices": {
             "robot": asdict(preflight.identities[0]),
             "robots": [
-                {**asdict(identity), "levels": None if levels is None else asdict(levels)}
-                for identity, levels in zip(preflight.identities, preflight.levels, strict=True)
+                {
+                    **asdict(identity),
+                    "levels": None if levels is None else asdict(levels),
+                    "led": settings.led_colour(number),
+                }
+                for number, (identity, levels) in enumerate(zip(preflight.identities, preflight.levels, strict=True))
             ],
             "profile": asdict(settings.profile()),
             **bench.devices(),

@@ -13,7 +13,7 @@ from lab.tally import Estimates
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Where a session stands, after a run. NaN where nothing is known yet."""
+    """Where a session stands, after a run. NaN where nothing is known yet; ``unknown``: none of the dictionary's."""
 
     line: int
     n: int
@@ -24,6 +24,7 @@ class Progress:
     sigma_perimeter_cm: float
     leading: str
     posterior: float
+    unknown: float
     battery_v: float
 
 
@@ -58,7 +59,9 @@ class Ledger:
     def reason_to_stop(self) -> str | None:
         """How the session ends now, or None to go on."""
         stop = self.stop
-        if stop.until is not None and self.n >= stop.at_least and self.recogniser.ranked()[0][1] >= stop.until:
+        sure = stop.until is not None and self.n >= stop.at_least and self.recogniser.ranked()[0][1] >= stop.until
+        # a shape that fits no entry has a favourite too
+        if sure and self.recogniser.unknown() <= 0.5:
             return "recognised"
         return "complete" if self.n >= stop.lines else None
 
@@ -76,6 +79,7 @@ class Ledger:
             figures["sigma_perimeter_cm"],
             leading,
             posterior,
+            self.recogniser.unknown() if self.n else math.nan,
             battery_v,
         )
 

@@ -173,7 +173,7 @@ class Listening:
         video = None
         if self._bench.recorder is not None:
             segment = await self._bench.recorder.close_segment()
-            video = {"frames": segment.frames, "dropped": segment.dropped}
+            video = {"frames": segment.frames, "dropped": segment.dropped, "late": segment.late}
             writer.commit_line(line, pd.DataFrame(columns=list(Sample.__slots__), dtype=float))
         speed_cm_s = self._settings.motion.speed_cm_s
         t_start_s = told.t_host_s - told.length_cm / speed_cm_s

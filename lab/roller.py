@@ -12,6 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
+from lab.base.colours import Rgb
 from lab.base.errors import ChordlabError
 from lab.run import Run
 from lab.settings import Settings
@@ -60,17 +61,25 @@ class Roller:
         settings: the session's.
         cruising_cm_s: the speed that its command's units allow.
         rng: source of its turns.
+        led_rgb: the colour of its LED, drive levels 0 to 1.
         note: takes what befalls it.
     """
 
     def __init__(
-        self, robot: RobotDevice, settings: Settings, cruising_cm_s: float, rng: np.random.Generator, note: Note
+        self,
+        robot: RobotDevice,
+        settings: Settings,
+        cruising_cm_s: float,
+        rng: np.random.Generator,
+        led_rgb: Rgb,
+        note: Note,
     ) -> None:
         self.robot = robot
         self.battery_v = math.nan
         self.bumped_s = -math.inf
         self._settings = settings
         self._cruising_cm_s = cruising_cm_s
+        self._led_rgb = led_rgb
         self._note = note
         self._light_latency_s = settings.profile().light_latency_s
         self._navigator: Navigator = navigator_for(settings.motion.turning, rng)
@@ -105,7 +114,7 @@ class Roller:
             raise SessionError(
                 f"{self.name}: battery at {identity.battery_v:.2f} V, below {settings.link.battery_low_v} V; charge it"
             )
-        await robot.set_led(settings.led.dark_level)
+        await robot.set_led(settings.led.dark_level, self._led_rgb)
         await robot.start_stream(settings.sensor.interval_s)
         return identity
 
@@ -334,7 +343,7 @@ class Roller:
             wanted = led.lit_level if run is not None and run.detector.lit else led.dark_level
             if wanted != shown:
                 try:
-                    await self.robot.set_led(wanted)
+                    await self.robot.set_led(wanted, self._led_rgb)
                 except ChordlabError as error:  # a missed blink costs the camera a label, not the session a line
                     _log.warning("LED not set: %s", error)
                 else:

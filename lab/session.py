@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from analysis.recognition import Recogniser
+from lab.base.colours import led_rgb
 from lab.base.errors import ChordlabError
 from lab.bench import SETTLE_S, Bench
 from lab.ledger import Ledger, Watcher
@@ -29,6 +30,7 @@ from robot.device import Identity
 from robot.edge import learn_edge_levels
 from robot.errors import ReconnectError
 from robot.turning import Leg
+from tracking.recorder import Recorder
 
 _log = logging.getLogger(__name__)
 
@@ -83,11 +85,13 @@ class Session:
         self._say = say
         self._tally = tally_for(settings)
         self._rollers = [
-            Roller(robot, settings, bench.cruising_cm_s, rng, self._noted)
-            for robot, rng in zip(bench.robots, rngs, strict=True)
+            Roller(robot, settings, bench.cruising_cm_s, rng, led_rgb(settings.led_colour(number)), self._noted)
+            for number, (robot, rng) in enumerate(zip(bench.robots, rngs, strict=True))
         ]
         self._writer: SessionWriter | None = None
         self._runs = 0
+        self._film_part = 0
+        self._committing_run = asyncio.Lock()
         self._state = "failed"
 
     async def preflight(self) -> Preflight:
@@ -126,6 +130,8 @@ class Session:
         t_start_s = loop.time()
         self._writer = writer
         writer.append("start", t_s=t_start_s, levels=[levels and asdict(levels) for levels in preflight.levels])
+        if self._bench.recorder is not None and self._films_all:
+            await self._bench.recorder.open_segment(writer.film_path(self._film_part))
         leds = [asyncio.create_task(roller.follow_with_led()) for roller in self._rollers]
         rolling = [
             asyncio.create_task(self._keep_rolling(roller, levels), name=roller.name)
@@ -173,20 +179,35 @@ class Session:
     async def _one_run(self, roller: Roller, leg: Leg, line: int) -> Run:
         """Roll one leg, filmed where there is a camera, and commit it."""
         recorder, writer = self._bench.recorder, self._committing
-        if recorder is not None:
+        if recorder is not None and not self._films_all:
             await recorder.open_segment(writer.video_path(line))
         run = await roller.roll_leg(leg, line)
         if run.ended == "bump" and self._met_another(roller, run.t_end_s):
             run.ended = "contact"
-        video = None
-        if recorder is not None:
-            segment = await recorder.close_segment()
-            video = {"frames": segment.frames, "dropped": segment.dropped}
-        writer.commit_line(line, run.light())
-        self._conclude(writer, run, video)
+        async with self._committing_run:
+            video = None if recorder is None else await self._cut_film(recorder, writer, line)
+            writer.commit_line(line, run.light())
+            self._conclude(writer, run, video)
         if self._watch is not None:
             self._watch(self._ledger.progress(self._tally.estimates, run.line, run.t_end_s, roller.battery_v))
         return run
+
+    @property
+    def _films_all(self) -> bool:
+        """Whether the film runs on from run to run, since the runs of several robots overlap."""
+        return len(self._rollers) > 1
+
+    async def _cut_film(self, recorder: Recorder, writer: SessionWriter, line: int) -> dict[str, int] | None:
+        """Close the video of the run that has ended; of several robots' film, what was filmed since the last cut."""
+        if self._films_all:
+            segment = await recorder.open_segment(writer.film_path(self._film_part + 1))
+            writer.adopt_film(self._film_part, line)
+            self._film_part += 1
+        else:
+            segment = await recorder.close_segment()
+        return None if segment is None else {
+            "frames": segment.frames, "dropped": segment.dropped, "late": segment.late
+        }  # fmt: skip
 
     @property
     def _committing(self) -> SessionWriter:
@@ -248,3 +269,5 @@ class Session:
                 await recorder.close_segment()
             except ChordlabError as error:  # the log must still say how the session ended
                 _log.error("the last video segment is lost: %s", error)
+        if recorder is not None and self._films_all:
+            self._committing.drop_film(self._film_part)

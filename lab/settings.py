@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self, cast
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 from shapely import Point, Polygon, box
 
+from lab.base.colours import LED_COLOURS
 from lab.base.errors import RequestError
 from lab.base.pinhole import Pinhole
 from lab.physics import Fraction, Positive, Section, VirtualSettings
@@ -133,6 +134,19 @@ class LedSettings(Section):
     """Brightness inside the shape."""
     height_cm: Positive = 7.3
     """Height of the LED above the floor."""
+    colours: tuple[str, ...] = tuple(LED_COLOURS)
+    """Colours of the robots' LEDs, in their order: `red`, `green`, `blue`, `yellow`, `magenta`, `cyan`, `orange`,
+    `violet`. By them the camera tells robots apart; the first ones lie farthest apart."""
+
+    @field_validator("colours")
+    @classmethod
+    def _colours_are_known(cls, colours: tuple[str, ...]) -> tuple[str, ...]:
+        for colour in colours:
+            if colour not in LED_COLOURS:
+                raise ValueError(f"{colour!r} is no LED colour; choose of {', '.join(LED_COLOURS)}")
+        if not colours or len(set(colours)) < len(colours):
+            raise ValueError("name each robot's LED colour once, in the order of the robots")
+        return colours
 
 
 class OpticsSettings(Section):
@@ -253,9 +267,10 @@ class Settings(Section):
         if len(self.robots) > 1:
             if any(robot.startswith("onboard:") for robot in self.robots):
                 raise ValueError("robot: a robot that estimates by itself rolls alone; list only one")
-            if self.camera != "none":
+            if self.camera != "none" and len(self.led.colours) < len(self.robots):
                 raise ValueError(
-                    "camera: several robots cannot be told apart on video yet; set it to none (--no-video)"
+                    f"led.colours: {len(self.robots)} filmed robots need as many colours, or the camera cannot tell "
+                    "them apart"
                 )
             if self.motion.turning is not Policy.LAMBERT:
                 raise ValueError("motion.turning: robots that meet need lambert, whose lines a contact only shortens")
@@ -278,6 +293,10 @@ class Settings(Section):
     def is_virtual(self) -> bool:
         """Whether the session runs on the virtual bench, at virtual time."""
         return self.robots[0] in _VIRTUAL_ROBOTS
+
+    def led_colour(self, number: int) -> str:
+        """The name of the LED colour of the ``number``-th robot, from 0; where nobody films them they may repeat."""
+        return self.led.colours[number % len(self.led.colours)]
 
     def profile(self) -> RobotProfile:
         """What the driver takes the robot for. Raises RequestError for a profile that cannot be read."""

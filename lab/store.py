@@ -10,6 +10,7 @@ import contextlib
 import hashlib
 import json
 import os
+import shutil
 from collections.abc import Generator, Iterator
 from datetime import datetime
 from pathlib import Path
@@ -89,6 +90,20 @@ class SessionWriter:
         aside.mkdir(exist_ok=True)
         return aside / VIDEO
 
+    def film_path(self, part: int) -> Path:
+        """Where a part of the film of several robots is recorded until a run's end cuts it off."""
+        aside = self._film_aside(part)
+        aside.mkdir()
+        return aside / VIDEO
+
+    def adopt_film(self, part: int, line: int) -> None:
+        """Make a part of the film, closed, that of the run that ended with it; before the run is committed."""
+        self._film_aside(part).rename(self._aside(line))
+
+    def drop_film(self, part: int) -> None:
+        """Throw away the part of the film that no committed run ended with."""
+        shutil.rmtree(self._film_aside(part), ignore_errors=True)
+
     def commit_line(self, line: int, light: pd.DataFrame) -> None:
         """Put a run's raw light samples beside its video segment and make the folder final."""
         aside = self._aside(line)
@@ -112,6 +127,9 @@ class SessionWriter:
         if not self._events.closed:
             self._events.close()
         self._lock.unlink(missing_ok=True)
+
+    def _film_aside(self, part: int) -> Path:
+        return self.folder / LINES / f"film-{part:06d}.part"
 
     def _aside(self, line: int) -> Path:
         return self.folder / LINES / f"{line:06d}.part"

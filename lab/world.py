@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lab.base.colours import led_yuv
 from lab.settings import BALL_RADIUS_CM, Settings
 from projector.virtual import LightSettings, VirtualProjector
 from robot.bolt import Bolt
@@ -164,7 +165,9 @@ def _view(body: Body, t_s: float, led_height_cm: float) -> RobotView:
     body.advance(t_s)
     vx_cm_s = body.speed_cm_s * math.cos(body.facing_rad)
     vy_cm_s = body.speed_cm_s * math.sin(body.facing_rad)
-    return RobotView(body.x_cm, body.y_cm, body.led_level, vx_cm_s, vy_cm_s, led_height_cm)
+    luma, u, v = led_yuv(body.led_rgb)
+    hue = (u / luma, v / luma) if luma > 0 else (0.0, 0.0)
+    return RobotView(body.x_cm, body.y_cm, luma, vx_cm_s, vy_cm_s, led_height_cm, led_uv=hue)
 
 
 def _faults(settings: Settings, number: int) -> list[Fault]:

@@ -86,7 +86,7 @@ class Bolt:
         self._facing_rad = 0.0
         self._raw: Request | None = None
         self._stream: Stream | None = None
-        self._led_level: float | None = None
+        self._led: tuple[float, tuple[float, float, float]] | None = None
         self._errands: set[asyncio.Task[None]] = set()
         self._now_s: Callable[[], float] = float
 
@@ -117,7 +117,7 @@ class Bolt:
         """
         if self._link.is_open:
             return
-        self._stream, self._led_level = None, None
+        self._stream, self._led = None, None
         self._heading_rad, self._facing_rad, self._raw = 0.0, 0.0, None
         self._wanted = True
         await self._open(again=False)
@@ -163,8 +163,8 @@ class Bolt:
             await self._set_up()
             if again and self._stream is not None:
                 await self._begin_stream(self._stream)
-            if again and self._led_level is not None:
-                await self.set_led(self._led_level)
+            if again and self._led is not None:
+                await self.set_led(*self._led)
             # Nobody would be told of a link that broke just after the last answer.
             self._check(self._link.is_open, "it broke while it was set up")
         except BaseException:
@@ -296,16 +296,18 @@ class Bolt:
             with contextlib.suppress(RobotError):
                 await self._link.ask(commands.lights(None, _DARK), timeout_s=_FAREWELL_TIMEOUT_S)
 
-    async def set_led(self, level: float) -> None:
-        """Light the whole matrix red at ``level`` from 0 (off) to 1 (full).
+    async def set_led(self, level: float, rgb: tuple[float, float, float] = (1.0, 0.0, 0.0)) -> None:
+        """Light the whole matrix at ``level`` from 0 (off) to 1 (full); ``rgb``: its colour at 1, red by default.
 
         Raises:
-            DriveError: The level is outside 0 to 1.
+            DriveError: The level, or one of the colour's parts, is outside 0 to 1.
         """
-        if not 0 <= level <= 1:
-            raise DriveError(f"an LED level of {level:g} does not exist: ask for 0 to 1", value=level)
-        await self._link.ask(commands.matrix_colour(round(255 * level), 0, 0))
-        self._led_level = level
+        for part in (level, *rgb):
+            if not 0 <= part <= 1:
+                raise DriveError(f"an LED level of {part:g} does not exist: ask for 0 to 1", value=part)
+        red, green, blue = (round(255 * level * part) for part in rgb)
+        await self._link.ask(commands.matrix_colour(red, green, blue))
+        self._led = level, rgb
 
     async def set_pixel(self, column: int, row: int, colour: Colour) -> None:
         """Light one pixel of the matrix, columns and rows 0 to 7; ``reconnect`` does not restore it.

@@ -120,8 +120,8 @@ class RobotDevice(Protocol):
         """Come to rest, facing as before."""
         ...
 
-    async def set_led(self, level: float) -> None:
-        """Light the whole matrix red at ``level`` from 0 (off) to 1 (full)."""
+    async def set_led(self, level: float, rgb: tuple[float, float, float] = (1.0, 0.0, 0.0)) -> None:
+        """Light the whole matrix at ``level`` from 0 (off) to 1 (full); ``rgb``: its colour at 1, red by default."""
         ...
 
     async def start_stream(self, interval_s: float) -> None:

@@ -59,6 +59,7 @@ class Body:
         speed_cm_s: Speed now.
         distance_cm: Path rolled since the start.
         led_level: Brightness of its LED, 0 to 1.
+        led_rgb: The same for its red, green and blue light.
         on_bump: Called from within ``advance`` for each ``Impact``.
         stuck_lux: What the light sensor reads whatever it sees; None while it works.
         battery_charge: 0 (empty) to 1, falling with time.
@@ -89,6 +90,7 @@ class Body:
         self.speed_cm_s = 0.0
         self.distance_cm = 0.0
         self.led_level = 0.0
+        self.led_rgb = (0.0, 0.0, 0.0)
         self.on_bump: Callable[[Impact], None] | None = None
         self.stuck_lux: float | None = None
         self.battery_charge = 1.0

@@ -133,7 +133,7 @@ class Firmware:
         self._collision_method = 0
         self._collision_dead_s = 0.0
         self._deaf_until_s = -math.inf
-        self._pixels = [0] * (MATRIX_SIDE * MATRIX_SIDE)
+        self._pixels: list[tuple[int, ...]] = [(0, 0, 0)] * (MATRIX_SIDE * MATRIX_SIDE)
         self._raw_cm_s: float | None = None
         self._raw_heading_rad = 0.0
         self._seen.clear()
@@ -315,17 +315,24 @@ class Firmware:
         return b""
 
     def _matrix_colour(self, data: bytes) -> bytes:
-        self._pixels = [max(data)] * len(self._pixels)
-        self.body.led_level = max(data) / 255
+        self._pixels = [tuple(data)] * len(self._pixels)
+        self._shine()
         return b""
 
     def _matrix_pixel(self, data: bytes) -> bytes:
         column, row, *colour = data
         if column >= MATRIX_SIDE or row >= MATRIX_SIDE:
             raise _RefusedError(commands.BAD_PARAMETER)
-        self._pixels[row * MATRIX_SIDE + column] = max(colour)
-        self.body.led_level = sum(self._pixels) / (255 * len(self._pixels))
+        self._pixels[row * MATRIX_SIDE + column] = tuple(colour)
+        self._shine()
         return b""
+
+    def _shine(self) -> None:
+        """What the matrix's pixels add up to, seen from afar."""
+        full = 255 * len(self._pixels)
+        self.body.led_level = sum(max(pixel) for pixel in self._pixels) / full
+        red, green, blue = (sum(parts) / full for parts in zip(*self._pixels, strict=True))
+        self.body.led_rgb = red, green, blue
 
     def _stream(self, data: bytes) -> bytes:
         interval_ms, count, self._primary = struct.unpack(">HBI", data)
