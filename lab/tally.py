@@ -164,7 +164,7 @@ def stored_estimate(lines: pd.DataFrame, crossings: pd.DataFrame) -> Estimate | 
         scale = crossed["weight"] / crossed["weight"].mean()
         moments = np.column_stack([scale * crossed[name] for name in ("k", "l1_cm", "l3_cm3")])
         return estimate_from_moments(len(crossed), moments.mean(axis=0), np.cov(moments, rowvar=False))
-    found = estimate_interrupted(_stored_cut_lines(counted, crossings))
+    found = estimate_interrupted(stored_cut_lines(counted, crossings))
     if found.lines < 2:
         return None
     area_area, area_perimeter, perimeter_perimeter = found.covariance()
@@ -172,7 +172,7 @@ def stored_estimate(lines: pd.DataFrame, crossings: pd.DataFrame) -> Estimate | 
     return Estimate(int((counted["k"] > 0).sum()), found.area(), found.perimeter(), covariance)
 
 
-def _stored_cut_lines(lines: pd.DataFrame, crossings: pd.DataFrame) -> list[CutLine]:
+def stored_cut_lines(lines: pd.DataFrame, crossings: pd.DataFrame) -> list[CutLine]:
     """The stored form of ``as_cut_line``."""
     points: dict[int, list[tuple[float, bool]]] = {}
     for line, s_cm, entering in crossings[["line", "s_cm", "entering"]].itertuples(index=False):
