@@ -29,6 +29,7 @@ check: setup
 	$(BIN)/codespell $(ROOMS) tests docs README.md CHANGELOG.md Makefile pyproject.toml
 
 bench: setup
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
 	$(BIN)/python -m pytest tests/bench -o addopts=--import-mode=importlib -o python_files='bench_*.py' -o timeout=600 \
 		--benchmark-columns=min,median,max,rounds --benchmark-sort=name $(ARGS)
 

@@ -10,6 +10,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon, Polygon
 
+from analysis.linekernels import Outline, outline_of
 from lab.base.errors import RequestError
 
 Floats = NDArray[np.float64]
@@ -44,6 +45,7 @@ class Boundary:
         centre_cm: the centre that was taken off.
         radius_cm: radius of the circumscribed circle.
         hull_perimeter_cm: perimeter of the convex hull.
+        outline: the vertices as `analysis.linekernels` wants them.
     """
 
     x_cm: Floats
@@ -54,6 +56,7 @@ class Boundary:
     centre_cm: tuple[float, float]
     radius_cm: float
     hull_perimeter_cm: float
+    outline: Outline
 
     @classmethod
     def of(cls, geometry: Geometry) -> Boundary:
@@ -90,15 +93,18 @@ class Boundary:
             middle = (stretch.min(axis=0) + stretch.max(axis=0)) / 2
             # A hair more than needed: a crossing exactly on the circle must not be lost to rounding.
             discs[row] = *middle, np.hypot(*(stretch - middle).T).max() * (1 + 1e-12) + 1e-12
+        x_cm, y_cm = np.ascontiguousarray(xy[:, 0]), np.ascontiguousarray(xy[:, 1])
+        ends = np.array(rings, dtype=np.int64)
         return cls(
-            x_cm=np.ascontiguousarray(xy[:, 0]),
-            y_cm=np.ascontiguousarray(xy[:, 1]),
-            rings=np.array(rings, dtype=np.int64),
+            x_cm=x_cm,
+            y_cm=y_cm,
+            rings=ends,
             chunks=np.array(chunks, dtype=np.int64),
             discs=discs,
             centre_cm=(float(centre.x), float(centre.y)),
             radius_cm=float(np.hypot(xy[:, 0], xy[:, 1]).max()),
             hull_perimeter_cm=float(geometry.convex_hull.length),
+            outline=outline_of(x_cm, y_cm, ends),
         )
 
     @property

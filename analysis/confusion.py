@@ -165,19 +165,14 @@ def measure_rates(
 
     On the tables' own lines the noise that they learnt would pass for a difference between entries.
     """
-    shape = tables.log_probability.shape[1:]
-    # A table that holds its own addresses: looking a line up in it gives the bin that the line falls in.
-    addresses = np.arange(float(np.prod(shape))).reshape(1, *shape)
-    index = LineTables(("bin",), tables.length_step_cm, addresses)
-    share = np.empty((len(entries), addresses.size))
+    share = np.empty((len(entries), len(tables.by_bin)))
     for row, (name, geometry) in enumerate(entries.items()):
         seen = simulate_lines(geometry, lines, rng) if model is None else model.sense(geometry, lines, rng).invariants()
-        bins = index.look_up(*seen)[:, 0].astype(np.int64)
-        share[row] = np.bincount(bins, minlength=addresses.size) / max(1, bins.size)
+        bins = tables.bins.address(*seen)
+        share[row] = np.bincount(bins, minlength=share.shape[1]) / max(1, bins.size)
         progress(name)
-    logs = tables.log_probability.reshape(len(entries), -1)
     used = share.any(axis=0)
-    share, logs = share[:, used], logs[:, used]
+    share, logs = share[:, used], tables.by_bin[used].T.astype(float)
     own = np.einsum("eb,eb->e", share, logs)
     rate = own[:, None] - share @ logs.T
     # ⟨(log p_i − log p_j)²⟩ under i, multiplied out.

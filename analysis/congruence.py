@@ -28,19 +28,17 @@ def congruence_classes(geometries: Mapping[str, Geometry]) -> list[tuple[str, ..
     In the order of the first name of each class. Two shapes are equal when one laid on the other leaves less than
     `SAME_SHARE` of the area uncovered.
     """
-    classes: list[list[str]] = []
-    figures: dict[str, Floats] = {}
-    for name, geometry in geometries.items():
-        figures[name] = _figures(geometry)
-        for members in classes:
-            first = members[0]
-            alike = np.allclose(figures[first], figures[name], rtol=_ALIKE, atol=0)
-            if alike and are_congruent(geometries[first], geometry):
-                members.append(name)
-                break
-        else:
-            classes.append([name])
-    return [tuple(members) for members in classes]
+    if not geometries:
+        return []
+    shapes = list(geometries.values())
+    figures = np.log([_figures(geometry) for geometry in shapes])
+    classes: dict[int, list[str]] = {}
+    for number, name in enumerate(geometries):
+        heads = np.fromiter(classes, dtype=np.int64)
+        alike = heads[np.all(np.abs(figures[heads] - figures[number]) <= _ALIKE, axis=1)]
+        same = next((head for head in map(int, alike) if are_congruent(shapes[head], shapes[number])), number)
+        classes.setdefault(same, []).append(name)
+    return [tuple(members) for members in classes.values()]
 
 
 def are_congruent(one: Geometry, other: Geometry) -> bool:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.stats import f as fisher
 
 from analysis.invariants import area_cm2, perimeter_cm
 from lab.base.errors import ChordlabError, RequestError
@@ -54,6 +55,34 @@ class Estimate:
     def correlation(self) -> float:
         """Correlation of area and perimeter; NaN where one of them does not scatter."""
         return float(_correlation(self.covariance[0, 0], self.covariance[1, 1], self.covariance[0, 1]))
+
+    def region(self, level: float, *, points: int = 181) -> tuple[Floats, Floats]:
+        """Outline (area_cm2, perimeter_cm) of where the truth lies with confidence ``level``; closed.
+
+        An ellipse in (log A, log P), in which the estimates are less skewed and never negative, its size by
+        Hotelling's T² because the covariance is estimated from the same lines. Needs three lines or more.
+
+        Raises:
+            RequestError: the level does not lie between 0 and 1, or there are fewer than three lines.
+        """
+        radius2 = self._hotelling(level)
+        size = np.array([self.area_cm2, self.perimeter_cm])
+        x, y = _contour(np.log(size), self.covariance / np.outer(size, size), radius2, points)
+        return np.exp(x), np.exp(y)
+
+    def holds(self, area_cm2: float, perimeter_cm: float, level: float) -> bool:
+        """Whether `region` at this level holds the given area and perimeter, both above 0."""
+        size = np.array([self.area_cm2, self.perimeter_cm])
+        off = np.log(np.array([area_cm2, perimeter_cm]) / size)
+        squared = off @ np.linalg.solve(self.covariance / np.outer(size, size), off)
+        return bool(squared <= self._hotelling(level))
+
+    def _hotelling(self, level: float) -> float:
+        """The squared radius 2(n − 1)/(n − 2) F(2, n − 2)."""
+        _check_level(level)
+        if self.n < 3:
+            raise RequestError(f"{self.n} line(s) say nothing about their own scatter: roll at least 3")
+        return float(2 * (self.n - 1) / (self.n - 2) * fisher.ppf(level, 2, self.n - 2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,11 +202,19 @@ def ellipse(mean: ArrayLike, covariance: ArrayLike, level: float, *, points: int
     belongs to the first coordinate. Closed: the last point is the first. For two dimensions the χ² quantile
     is −2 ln(1 − level).
     """
+    _check_level(level)
+    return _contour(np.asarray(mean, dtype=float), np.asarray(covariance, dtype=float), -2 * np.log1p(-level), points)
+
+
+def _check_level(level: float) -> None:
     if not 0 < level < 1:
         raise RequestError(f"a confidence level lies between 0 and 1, not {level}")
-    centre = np.asarray(mean, dtype=float)
-    values, vectors = np.linalg.eigh(np.asarray(covariance, dtype=float))
-    radii = np.sqrt(np.maximum(values, 0.0) * -2 * np.log1p(-level))
+
+
+def _contour(centre: Floats, covariance: Floats, radius2: float, points: int) -> tuple[Floats, Floats]:
+    """Where the squared Mahalanobis distance from ``centre`` is ``radius2``."""
+    values, vectors = np.linalg.eigh(covariance)
+    radii = np.sqrt(np.maximum(values, 0.0) * radius2)
     phase = np.linspace(0, 2 * np.pi, points)
     circle = np.stack([np.cos(phase), np.sin(phase)])
     x, y = centre[:, None] + vectors @ (radii[:, None] * circle)

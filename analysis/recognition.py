@@ -5,7 +5,8 @@ The per-line recogniser, which needs some ten times fewer lines, is `analysis.pe
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from analysis.estimate import ratio_bias
 from analysis.invariants import area_cm2, perimeter_cm
+from analysis.outsider import OUTSIDER_PRIOR
 from analysis.quadrature import Moments
 from lab.base.errors import RequestError
 
@@ -28,6 +30,11 @@ class Recogniser(Protocol):
     @property
     def names(self) -> tuple[str, ...]:
         """The entries, in the dictionary's order."""
+        ...
+
+    @property
+    def classes(self) -> tuple[tuple[str, ...], ...]:
+        """The entries sorted into classes that no lines tell apart; most have one member."""
         ...
 
     @property
@@ -48,11 +55,15 @@ class Recogniser(Protocol):
         ...
 
     def posterior(self) -> dict[str, float]:
-        """Probability of each entry; they sum to 1."""
+        """Probability of each entry, given that the shape is one of them; they sum to 1, and twins share evenly."""
         ...
 
     def ranked(self) -> list[tuple[str, float]]:
-        """(name, probability), the most probable first."""
+        """(name, probability) of each class, the most probable first, under its first member's name."""
+        ...
+
+    def unknown(self) -> float:
+        """Probability that the shape is none of the dictionary's."""
         ...
 
     def reset(self) -> None:
@@ -103,10 +114,18 @@ class GaussianRecogniser:
     Args:
         entries: exact moments of each entry, from `analysis.quadrature.exact_moments`.
         prior: relative prior weight of each entry, > 0; equal without it.
+        classes: the twins among the entries, from `analysis.congruence.congruence_classes`.
     """
 
-    def __init__(self, entries: Mapping[str, Moments], *, prior: Mapping[str, float] | None = None) -> None:
+    def __init__(
+        self,
+        entries: Mapping[str, Moments],
+        *,
+        prior: Mapping[str, float] | None = None,
+        classes: Sequence[Sequence[str]] = (),
+    ) -> None:
         self.names = tuple(entries)
+        self.classes = class_heads(self.names, classes)
         self._log_prior = log_prior(self.names, prior)
         moments = list(entries.values())
         self._size = np.array([[m.area_cm2, m.perimeter_cm] for m in moments])
@@ -148,8 +167,22 @@ class GaussianRecogniser:
         return self.posterior_at(float(area_cm2(l1, l3)), float(perimeter_cm(k, l1, l3)), effective)
 
     def ranked(self) -> list[tuple[str, float]]:
-        """(name, probability), the most probable first."""
-        return rank(self.posterior())
+        """(name, probability) of each class, the most probable first, under its first member's name."""
+        return rank_classes(self.posterior(), self.classes)
+
+    def unknown(self) -> float:
+        """Probability that the shape is none of the dictionary's, from how far the estimate lies from every entry.
+
+        A p-value p of the χ² distance speaks against an entry by at most −e·p·ln p to one (Sellke, Bayarri and
+        Berger, The American Statistician 55, 2001). `OUTSIDER_PRIOR` before `FIRST_POSTERIOR_N` lines.
+        """
+        if self._n < FIRST_POSTERIOR_N:
+            return OUTSIDER_PRIOR
+        k, l1, l3 = self._sums / self._weights.total
+        area, perimeter = float(area_cm2(l1, l3)), float(perimeter_cm(k, l1, l3))
+        p_value = math.exp(-0.5 * min(self.misfit(area, perimeter, self._weights.effective_lines).values()))
+        entry = -math.e * p_value * math.log(p_value) if 0 < p_value < math.exp(-1) else float(p_value > 0)
+        return OUTSIDER_PRIOR / (OUTSIDER_PRIOR + (1 - OUTSIDER_PRIOR) * entry)
 
     def posterior_at(self, area: float, perimeter: float, n: float) -> dict[str, float]:
         """Probability of each entry for an estimate (cm², cm) from ``n`` lines: the likelihood landscape."""
@@ -164,11 +197,20 @@ class GaussianRecogniser:
         distance2, _ = self._terms(area, perimeter, n)
         return {name: float(value) for name, value in zip(self.names, distance2, strict=True)}
 
-    def _terms(self, area: float, perimeter: float, n: float) -> tuple[Floats, Floats]:
+    def landscape(self, area: ArrayLike, perimeter: ArrayLike, n: float) -> Floats:
+        """Posterior (…, entries) at estimates (cm², cm) of any one shape of array, each from ``n`` lines."""
+        distance2, log_norm = self._terms(area, perimeter, n)
+        logs = self._log_prior - 0.5 * distance2 - log_norm
+        weights = np.exp(logs - logs.max(axis=-1, keepdims=True))
+        return weights / weights.sum(axis=-1, keepdims=True)
+
+    def _terms(self, area: ArrayLike, perimeter: ArrayLike, n: float) -> tuple[Floats, Floats]:
+        """Squared distances (…, entries) and log norms (entries,)."""
         covariance = self._relative / n
-        relative_error = np.array([area, perimeter]) / self._size - 1 - self._bias / n
+        estimates = np.stack([np.asarray(area, dtype=float), np.asarray(perimeter, dtype=float)], axis=-1)
+        relative_error = estimates[..., None, :] / self._size - 1 - self._bias / n
         # In relative units; the determinant of the absolute covariance then needs the sizes.
-        distance2 = np.einsum("ei,eij,ej->e", relative_error, np.linalg.inv(covariance), relative_error)
+        distance2 = np.einsum("...ei,eij,...ej->...e", relative_error, np.linalg.inv(covariance), relative_error)
         log_norm = 0.5 * np.linalg.slogdet(covariance)[1] + np.log(self._size).sum(axis=1)
         return distance2, log_norm
 
@@ -191,6 +233,19 @@ def normalised(names: tuple[str, ...], log_weights: Floats) -> dict[str, float]:
     return {name: float(value) for name, value in zip(names, weights / weights.sum(), strict=True)}
 
 
-def rank(posterior: Mapping[str, float]) -> list[tuple[str, float]]:
-    """Sort a posterior, the most probable first; ties keep the dictionary's order."""
-    return sorted(posterior.items(), key=lambda item: -item[1])
+def class_heads(names: tuple[str, ...], classes: Sequence[Sequence[str]]) -> tuple[tuple[str, ...], ...]:
+    """Sort all ``names`` into classes: those given, and one for each name that is in none.
+
+    Raises RequestError where a class names what is not among them.
+    """
+    given = {name: tuple(members) for members in classes for name in members}
+    strangers = sorted(given.keys() - set(names))
+    if strangers:
+        raise RequestError(f"{', '.join(strangers)}: in a class of twins, but not in the dictionary")
+    return tuple(dict.fromkeys(given.get(name, (name,)) for name in names))
+
+
+def rank_classes(posterior: Mapping[str, float], classes: Sequence[Sequence[str]]) -> list[tuple[str, float]]:
+    """Add up each class under its first member's name, the most probable first; ties keep the dictionary's order."""
+    summed = [(members[0], sum(posterior[name] for name in members)) for members in classes]
+    return sorted(summed, key=lambda item: -item[1])

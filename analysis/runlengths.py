@@ -23,7 +23,7 @@ from shapely.geometry import Polygon
 from analysis.billiard import check_exponent, hit_and_run, roll
 from analysis.boundary import Boundary, Geometry
 from analysis.invariants import area_cm2, perimeter_cm
-from analysis.kernels import ragged_invariants, trace_lines
+from analysis.montecarlo import cross_lines
 from analysis.turninglaw import Exponent, LawTable, tabulate_law
 from lab.base.errors import RequestError
 
@@ -358,21 +358,7 @@ def _shares_beyond(null: Floats, statistic: ArrayLike) -> Floats:
 
 def _shape_sums(boundary: Boundary, theta_rad: Floats, p_cm: Floats) -> Floats:
     """Sums of (k, 𝓛_1, 𝓛_3) over those of the lines that cross the shape."""
-    x_cm, y_cm = boundary.centre_cm
-    about_cm = p_cm - x_cm * np.cos(theta_rad) - y_cm * np.sin(theta_rad)
-    near = np.abs(about_cm) < boundary.radius_cm
-    places = np.column_stack([theta_rad[near] / np.pi, (about_cm[near] / boundary.radius_cm + 1) / 2])
-    sums = np.zeros(3)
-    while len(places):
-        s_cm, counts = np.empty(boundary.edges + 4 * len(places)), np.empty(len(places), dtype=np.int64)
-        rings = (boundary.x_cm, boundary.y_cm, boundary.chunks, boundary.discs)
-        hits, used, filled = trace_lines(places, len(places), boundary.radius_cm, rings, (s_cm, counts))
-        k = np.empty(hits, dtype=np.int64)
-        l1_cm, l3_cm3 = np.empty(hits), np.empty(hits)
-        ragged_invariants(s_cm[:filled], counts[:hits], k, l1_cm, l3_cm3)
-        sums += k.sum(), l1_cm.sum(), l3_cm3.sum()
-        places = places[used:]
-    return sums
+    return np.array([column.sum() for column in cross_lines(boundary, theta_rad, p_cm)], dtype=float)
 
 
 def _sizes(sums: Floats) -> Floats:

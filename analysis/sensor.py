@@ -8,18 +8,17 @@ errors, and they cancel.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.blocks import Progress, run_blocks
 from analysis.boundary import Boundary, Geometry
 from analysis.estimate import relative_covariance
 from analysis.invariants import area_cm2, perimeter_cm
-from analysis.kernels import available_cores
 from analysis.quadrature import Moments
-from analysis.sensorkernels import sense_lines
+from analysis.sensorkernels import sense_given, sense_lines
 from lab.base.errors import RequestError
 
 Floats = NDArray[np.float64]
@@ -88,11 +87,18 @@ class SensorModel:
         return offsets_cm, radius_cm * np.sin(angle), 2 / (_SLICES + 1) * np.sin(angle) ** 2
 
     def sense(
-        self, geometry: Geometry, lines: int, rng: np.random.Generator, *, threads: int | None = None
+        self,
+        geometry: Geometry,
+        lines: int,
+        rng: np.random.Generator,
+        *,
+        progress: Progress | None = None,
+        threads: int | None = None,
     ) -> SensedLines:
         """Roll along about ``lines`` random lines that cross ``geometry`` (cm).
 
         The result depends on the generator alone, not on the number of ``threads`` (default: the cores).
+        ``progress`` is called with (lines rolled, in all).
 
         Raises:
             RequestError: fewer than one line.
@@ -105,21 +111,18 @@ class SensorModel:
         extent_cm = boundary.radius_cm + self.footprint_cm
         measure_cm = 2 * np.pi * extent_cm
         thrown = max(lines, round(lines * measure_cm / boundary.hull_perimeter_cm))
-        sizes = [_BLOCK_LINES] * (thrown // _BLOCK_LINES) + [thrown % _BLOCK_LINES] * (thrown % _BLOCK_LINES > 0)
         outline = (boundary.x_cm, boundary.y_cm, boundary.chunks, boundary.discs)
         motion = (float(self.step_cm), float(self.jitter_cm), float(self.speed_sigma))
         noise, levels = float(self.noise), self.levels
 
-        def work(size: int, stream: np.random.Generator) -> tuple[Ints, Floats, Floats, Floats]:
-            seen = np.empty(size, dtype=np.int64), np.empty(size), np.empty(size)
+        def work(first: int, last: int, stream: np.random.Generator) -> tuple[Ints, Floats, Floats, Floats]:
+            seen = _columns(last - first)
             excess = sense_lines(stream, extent_cm, outline, footprint, motion, levels, noise, seen)
             k, l1_cm, l3_cm3 = seen
             some = k > 0
             return k[some], l1_cm[some], l3_cm3[some], excess
 
-        streams = rng.spawn(len(sizes))
-        with ThreadPoolExecutor(threads or available_cores(), thread_name_prefix="sensor") as pool:
-            blocks = list(pool.map(work, sizes, streams))
+        blocks = list(run_blocks(work, thrown, _BLOCK_LINES, rng, threads=threads, progress=progress))
         return SensedLines(
             k=np.concatenate([block[0] for block in blocks]),
             l1_cm=np.concatenate([block[1] for block in blocks]),
@@ -127,6 +130,26 @@ class SensorModel:
             measure_per_line_cm=measure_cm / thrown,
             excess=np.sum([block[3] for block in blocks], axis=0),
         )
+
+    def along(
+        self, boundary: Boundary, theta_rad: Floats, p_cm: Floats, rng: np.random.Generator
+    ) -> tuple[Ints, Floats, Floats]:
+        """Roll along given lines x cos θ + y sin θ = p: (k, 𝓛_1 in cm, 𝓛_3 in cm³), 0 where nothing is seen."""
+        cos, sin = np.cos(theta_rad), np.sin(theta_rad)
+        x_cm, y_cm = boundary.centre_cm
+        seen = _columns(theta_rad.size)
+        sense_given(
+            rng,
+            (cos, sin, p_cm - x_cm * cos - y_cm * sin),
+            boundary.radius_cm + self.footprint_cm,
+            (boundary.x_cm, boundary.y_cm, boundary.chunks, boundary.discs),
+            self.footprint(),
+            (float(self.step_cm), float(self.jitter_cm), float(self.speed_sigma)),
+            self.levels,
+            float(self.noise),
+            seen,
+        )
+        return seen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -182,3 +205,7 @@ class SensedLines:
             relative=relative_covariance(mean, covariance),
             error=float((self.measure_per_line_cm * np.sqrt(self.excess[1]) / integrals).max()),
         )
+
+
+def _columns(lines: int) -> tuple[Ints, Floats, Floats]:
+    return np.empty(lines, dtype=np.int64), np.empty(lines), np.empty(lines)

@@ -31,7 +31,9 @@ def cross_parallel(
     """Find the sorted crossings of lines parallel to a line; returns how many there are on all of them.
 
     ``direction`` is the line's (cos θ, sin θ, p); line i has p + ``offsets_cm[i]`` and fills ``t_cm[i]`` (lines,
-    edges) and ``counts[i]``. ``boundary`` is as for `analysis.kernels.trace_lines`.
+    edges) and ``counts[i]``. ``boundary`` is (x_cm, y_cm, chunks, discs) of an
+    `analysis.boundary.Boundary`: circles round stretches of edges, so that a whole stretch away from the line is
+    skipped at once.
     """
     cos, sin, p = direction
     x_cm, y_cm, chunks, discs = boundary
@@ -189,6 +191,40 @@ def detect(s_cm: Floats, light: Floats, readings: int, levels: tuple[float, floa
 
 
 @kernel
+def sense_line(
+    rng: np.random.Generator,
+    crossings: tuple[Floats, Ints],
+    slices: tuple[Floats, Floats],
+    motion: tuple[float, float, float],
+    levels: tuple[float, float, float],
+    noise: float,
+    room: tuple[float, Floats, Floats, Floats],
+) -> tuple[int, float, float]:
+    """Roll along one line; returns the (k, 𝓛_1, 𝓛_3) that are measured.
+
+    Arguments as for `read_light` and `sense_lines`; ``room`` is (phase, s_cm, light, found_cm).
+    """
+    step_cm, jitter_cm, speed_sigma = motion
+    phase, s_cm, light, found_cm = room
+    # Six noise widths beyond the thresholds nothing can happen that the next reading would not undo.
+    clear = (levels[0] - 6.0 * noise, levels[2] + 6.0 * noise)
+    speed = max(_SLOWEST, 1.0 + speed_sigma * rng.standard_normal()) if speed_sigma > 0.0 else 1.0
+    readings = read_light(crossings, slices, speed * step_cm, phase, clear, s_cm, light)
+    last = -np.inf
+    for i in range(readings):
+        # The robot takes its speed for what it should be.
+        place = s_cm[i] / speed
+        if jitter_cm > 0.0:
+            place = max(last, place + jitter_cm * rng.standard_normal())
+        s_cm[i] = place
+        last = place
+        if noise > 0.0:
+            light[i] += noise * rng.standard_normal()
+    found = detect(s_cm, light, readings, levels, found_cm)
+    return chord_invariants(found_cm, 0, found)
+
+
+@kernel
 def sense_lines(
     rng: np.random.Generator,
     extent_cm: float,
@@ -207,19 +243,16 @@ def sense_lines(
     Returns (2, 3): the sums over the lines of what was measured less the true (k, 𝓛_1, 𝓛_3), and of the squares.
     """
     offsets_cm, half_cm, weight = footprint
-    step_cm, jitter_cm, speed_sigma = motion
     k, l1_cm, l3_cm3 = seen
     slices = offsets_cm.size
     t_cm = np.empty((slices, boundary[0].size))
     counts = np.zeros(slices, np.int64)
-    room = int(2.0 * (extent_cm + half_cm.max()) / (_SLOWEST * step_cm)) + 8
-    s_cm = np.empty(room)
-    light = np.empty(room)
-    found_cm = np.empty(room + 1)
+    size = int(2.0 * (extent_cm + half_cm.max()) / (_SLOWEST * motion[0])) + 8
+    s_cm = np.empty(size)
+    light = np.empty(size)
+    found_cm = np.empty(size + 1)
     excess = np.zeros((2, 3))
     difference = np.empty(3)
-    # Six noise widths beyond the thresholds nothing can happen that the next reading would not undo.
-    clear = (levels[0] - 6.0 * noise, levels[2] + 6.0 * noise)
     for line in range(k.size):
         k[line] = 0
         l1_cm[line] = 0.0
@@ -231,23 +264,48 @@ def sense_lines(
             continue
         middle = slices // 2
         true_k, true_1, true_3 = chord_invariants(t_cm[middle], 0, counts[middle])
-        speed = max(_SLOWEST, 1.0 + speed_sigma * rng.standard_normal()) if speed_sigma > 0.0 else 1.0
-        readings = read_light((t_cm, counts), (half_cm, weight), speed * step_cm, phase, clear, s_cm, light)
-        last = -np.inf
-        for i in range(readings):
-            # The robot takes its speed for what it should be.
-            place = s_cm[i] / speed
-            if jitter_cm > 0.0:
-                place = max(last, place + jitter_cm * rng.standard_normal())
-            s_cm[i] = place
-            last = place
-            if noise > 0.0:
-                light[i] += noise * rng.standard_normal()
-        found = detect(s_cm, light, readings, levels, found_cm)
-        k[line], l1_cm[line], l3_cm3[line] = chord_invariants(found_cm, 0, found)
+        room = (phase, s_cm, light, found_cm)
+        k[line], l1_cm[line], l3_cm3[line] = sense_line(
+            rng, (t_cm, counts), (half_cm, weight), motion, levels, noise, room
+        )
         difference[0] = k[line] - true_k
         difference[1] = l1_cm[line] - true_1
         difference[2] = l3_cm3[line] - true_3
         excess[0] += difference
         excess[1] += difference * difference
     return excess
+
+
+@kernel
+def sense_given(
+    rng: np.random.Generator,
+    lines: tuple[Floats, Floats, Floats],
+    extent_cm: float,
+    boundary: tuple[Floats, Floats, Ints, Floats],
+    footprint: tuple[Floats, Floats, Floats],
+    motion: tuple[float, float, float],
+    levels: tuple[float, float, float],
+    noise: float,
+    seen: tuple[Ints, Floats, Floats],
+) -> None:
+    """As `sense_lines`, along given ``lines`` (cos θ, sin θ, p in cm); ``extent_cm`` bounds the shape and footprint."""
+    cos, sin, p_cm = lines
+    offsets_cm, half_cm, weight = footprint
+    k, l1_cm, l3_cm3 = seen
+    t_cm = np.empty((offsets_cm.size, boundary[0].size))
+    counts = np.zeros(offsets_cm.size, np.int64)
+    size = int(2.0 * (extent_cm + half_cm.max()) / (_SLOWEST * motion[0])) + 8
+    s_cm = np.empty(size)
+    light = np.empty(size)
+    found_cm = np.empty(size + 1)
+    for line in range(k.size):
+        k[line] = 0
+        l1_cm[line] = 0.0
+        l3_cm3[line] = 0.0
+        direction = (cos[line], sin[line], p_cm[line])
+        if abs(p_cm[line]) > extent_cm or cross_parallel(direction, offsets_cm, boundary, t_cm, counts) == 0:
+            continue
+        room = (rng.random(), s_cm, light, found_cm)
+        k[line], l1_cm[line], l3_cm3[line] = sense_line(
+            rng, (t_cm, counts), (half_cm, weight), motion, levels, noise, room
+        )

@@ -16,6 +16,8 @@ from lab.store import MANIFEST
 
 Progress = Callable[[int, int], None]
 
+_TWINS = "; "
+
 
 def sessions_below(roots: Sequence[Path]) -> list[Path]:
     """Every session folder at or below the roots, in order. Raises RequestError when there is none."""
@@ -45,7 +47,9 @@ def _flat(summary: dict[str, Any]) -> Iterator[tuple[str, Any]]:
             continue
         if isinstance(value, dict):
             for inner, item in value.items():  # pyright: ignore[reportUnknownVariableType]: a summary's section
-                if not isinstance(item, (list, dict)):
+                if inner == "twins" and isinstance(item, list):
+                    yield f"{name}_{inner}", _TWINS.join(map(str, item))  # pyright: ignore[reportUnknownArgumentType]: names
+                elif not isinstance(item, (list, dict)):
                     yield f"{name}_{inner}", item
         else:
             yield name, value
@@ -70,6 +74,13 @@ def analyse(folders: Sequence[Path], *, workers: int, progress: Progress | None 
     return pd.DataFrame([rows[folder] for folder in folders])
 
 
+def _is_right(row: pd.Series[Any]) -> bool:
+    """Whether a session's answer is its shape; a twin's name, which no lines tell apart, is as good."""
+    named = {row["recognised_name"], *str(row.get("recognised_twins", "")).split(_TWINS)}
+    unknown = row.get("recognised_unknown")
+    return row["shape"] in named and not (unknown is not None and unknown > 0.5)
+
+
 def per_shape(table: pd.DataFrame) -> pd.DataFrame:
     """Per shape: sessions, share recognised, mean relative error of A and P and their spread in standard errors."""
     if "shape" not in table.columns:
@@ -78,7 +89,7 @@ def per_shape(table: pd.DataFrame) -> pd.DataFrame:
     frame = pd.DataFrame(
         {
             "shape": whole["shape"],
-            "right": whole["recognised_name"] == whole["shape"],
+            "right": [_is_right(row) for _, row in whole.iterrows()],
             "area_error": whole["robot_area_cm2"] / whole["truth_area_cm2"] - 1,
             "perimeter_error": whole["robot_perimeter_cm"] / whole["truth_perimeter_cm"] - 1,
             "area_z": (whole["robot_area_cm2"] - whole["truth_area_cm2"]) / whole["robot_sigma_area_cm2"],

@@ -4,8 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
-from analysis.perline import LineRecogniser, tables_of
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from analysis.congruence import congruence_classes
+from analysis.perline import LineRecogniser, LineTables, tables_of
+from analysis.recognition import Recogniser
 from analysis.sensor import SensorModel
 from analysis.tablestore import TableStore, learn_lines
 from lab.pictures import span_of
@@ -13,9 +20,66 @@ from lab.settings import Settings, VirtualSettings
 from projector.shape import Shape
 from robot.crossings import threshold_margin
 
-# Lines that follow each other at a wall are not independent (lag-1 correlation up to 0.24, so that n lines
-# are worth (1 - 0.24)/(1 + 0.24) n = 0.6 n); counting them in full would make the posterior overconfident.
-_WEIGHT = 0.6
+# Lines that follow each other at a wall are not quite independent, and tables learnt from finitely many lines not
+# quite exact. At this weight, over simulated sessions with bounces in a rectangle, a posterior of 95 % was right 97
+# times in a hundred for the paper's six, 93 times for the letters.
+LINE_WEIGHT = 0.85
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recognition:
+    """What a session's lines say.
+
+    Attributes:
+        ranking: (name, probability) of each class of twins at the end, the most probable first, given that the shape
+            is in the dictionary.
+        posteriors: ``n`` and one column for each entry: the posterior after each crossing line.
+        unknown: (lines,) probability, after each crossing line, that the shape is none of the dictionary's.
+        classes: the twins, two or more names each, that no lines tell apart.
+    """
+
+    ranking: list[tuple[str, float]]
+    posteriors: pd.DataFrame
+    unknown: NDArray[np.float64]
+    classes: tuple[tuple[str, ...], ...]
+
+    @property
+    def is_unknown(self) -> bool:
+        """Whether at the end "none of these" is likelier than all entries together."""
+        return bool(self.unknown.size and self.unknown[-1] > 0.5)
+
+    @property
+    def answer(self) -> tuple[str, ...]:
+        """The names of the leading class; none where the shape is unknown."""
+        return () if self.is_unknown else (self.ranking[0][0], *self.twins_of(self.ranking[0][0]))
+
+    def twins_of(self, name: str) -> tuple[str, ...]:
+        """The other members of a name's class."""
+        return tuple(other for members in self.classes if name in members for other in members if other != name)
+
+
+def recognise_lines(recogniser: Recogniser, lines: pd.DataFrame) -> Recognition:
+    """Take a session's crossing lines, in order.
+
+    Args:
+        recogniser: fresh, or it is reset.
+        lines: rows of the ``lines`` table with k > 0; those that are not ``whole`` count, but are not looked at.
+    """
+    recogniser.reset()
+    rows: list[dict[str, float]] = []
+    unknown: list[float] = []
+    columns = lines[["whole", "k", "l1_cm", "l3_cm3", "weight"]]
+    for n, (whole, k, l1_cm, l3_cm3, weight) in enumerate(columns.itertuples(index=False), start=1):
+        if whole:
+            recogniser.update(k, l1_cm, l3_cm3, weight)
+        rows.append({"n": n, **recogniser.posterior()})
+        unknown.append(recogniser.unknown())
+    return Recognition(
+        recogniser.ranked(),
+        pd.DataFrame(rows, columns=["n", *recogniser.names]),
+        np.array(unknown),
+        tuple(members for members in recogniser.classes if len(members) > 1),
+    )
 
 
 def sensor_model(settings: Settings) -> SensorModel:
@@ -43,14 +107,29 @@ def recogniser_for(
     dictionary: Mapping[str, Shape],
     settings: Settings,
     *,
+    called: str | None = None,
     progress: Callable[[int, int], None] | None = None,
     store: TableStore | None = None,
 ) -> LineRecogniser:
     """Learn how each entry's lines look through the robot's sensor, or read it from the user's cache.
 
     The same robot gives the same recogniser, whatever the session's seed: a stored session, read again, finds the
-    posteriors of its log.
+    posteriors of its log. A class of twins goes by the name ``called``, where that is one of them.
     """
+    tables = tables_for(dictionary, settings, called=called, progress=progress, store=store)
+    return LineRecogniser(tables, weight=LINE_WEIGHT)
+
+
+def tables_for(
+    dictionary: Mapping[str, Shape],
+    settings: Settings,
+    *,
+    called: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    store: TableStore | None = None,
+) -> LineTables:
+    """The tables of the recogniser; arguments as for `recogniser_for`."""
     outlines = {name: shape.geometry for name, shape in dictionary.items()}
     seen = learn_lines(outlines, sensor_model(settings), store=store or TableStore(), progress=progress)
-    return LineRecogniser(tables_of({name: lines.invariants() for name, lines in seen.items()}), weight=_WEIGHT)
+    classes = [sorted(members, key=lambda name: name != called) for members in congruence_classes(outlines)]
+    return tables_of({name: lines.invariants() for name, lines in seen.items()}, classes)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,8 @@ import pandas as pd
 from shapely import Polygon
 from shapely.geometry import shape as shape_of
 
+from analysis.bandcheck import MonteCarloCheck
+from analysis.budget import Budget
 from analysis.estimate import Estimate, estimate
 from analysis.figures.values import Band, Entry, Isotropy
 from analysis.invariants import invariants_table
@@ -21,24 +23,35 @@ from analysis.quadrature import Moments, exact_moments
 from analysis.report.result import RunCheck, SessionResult
 from analysis.report.verdict import verdict_of
 from analysis.report.write import write_report
+from lab.attribution import attribute, camera_estimate, lines_from_the_edge
 from lab.base.errors import RequestError
+from lab.budget import session_budget
 from lab.experiment import dictionary_with
 from lab.finalize import Tables, finalize
-from lab.recognisers import recogniser_for
+from lab.recognisers import Recognition, recognise_lines, recogniser_for
 from lab.runcheck import check_runs
 from lab.session import CONTACT_WINDOW_S
 from lab.settings import Settings, parse_settings
+from lab.simulated import check_against_simulation
 from lab.store import REPORT, SessionReader
 from lab.tally import stored_estimate
+from projector.collections import load_dictionary
 from projector.shape import Shape, Silhouette
 from robot.contacts import contacts_among
+from robot.turning import Policy
+from tracking.anisotropy import TooFewHitsError, bias_from
 from tracking.calibration import Calibration
+from tracking.identity import LedMark
+from tracking.innovations import FilterHealth, filter_health
 from tracking.isotropy import IsotropyReport, TooFewLinesError, examine_lines
 from tracking.linespace import LineSpace
+from tracking.matching import ChordMatch, match_crossings
 from tracking.runs import fit_lines
 from tracking.segment import frames_table
+from tracking.straightness import Straightness, straightness
+from tracking.table import systematic_cm
 from tracking.track import track_segments
-from tracking.truth import ChordMatch, match_crossings, true_crossings
+from tracking.truth import near_chords, true_crossings
 
 Progress = Callable[[int, int], None]
 
@@ -55,7 +68,7 @@ _BAND_POINTS = 40
 
 @dataclass(frozen=True, slots=True)
 class Filmed:
-    """What the camera saw of a session."""
+    """What the camera saw of a session. ``tested``: the lines that isotropy is judged by."""
 
     track: pd.DataFrame
     lines: pd.DataFrame
@@ -63,6 +76,9 @@ class Filmed:
     match: ChordMatch
     estimate: Estimate | None
     isotropy: IsotropyReport | None
+    tested: pd.DataFrame
+    straightness: Straightness | None
+    health: FilterHealth
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,11 +91,12 @@ class Reviewed:
     tables: Tables
     moments: dict[str, Moments]
     titles: dict[str, str]
-    ranking: list[tuple[str, float]]
-    posteriors: pd.DataFrame
+    recognition: Recognition
     robot: Estimate | None
     filmed: Filmed | None
     runs: RunCheck | None
+    budget: Budget | None = None
+    montecarlo: MonteCarloCheck | None = None
 
 
 def stored_shape(session: SessionReader) -> Shape:
@@ -107,41 +124,43 @@ def examine(folder: Path, *, workers: int | None = None, progress: Progress | No
     rng = np.random.default_rng(settings.seed)
     tables = finalize(folder)
     dictionary = dictionary_with(shape, settings)
-    ranking, posteriors = _recognised(dictionary, settings, tables)
-    return Reviewed(
+    recognition = _recognised(dictionary, settings, tables, shape.name)
+    found = Reviewed(
         session=session,
         settings=settings,
         shape=shape,
         tables=tables,
         moments={name: exact_moments(entry.geometry) for name, entry in dictionary.items()},
         titles={name: entry.title for name, entry in dictionary.items()},
-        ranking=ranking,
-        posteriors=posteriors,
+        recognition=recognition,
         robot=stored_estimate(tables.lines, tables.crossings),
         filmed=_filmed(
             session, settings, shape.geometry, tables, rng, workers or max(1, available_cores() // 2), progress
         ),
         runs=check_runs(tables.lines, shape.geometry, settings, rng),
     )
+    return replace(
+        found,
+        budget=session_budget(found, rng),
+        montecarlo=check_against_simulation(tables, shape.geometry, settings, rng.spawn(1)[0]),
+    )
 
 
 def recognised(session: SessionReader, tables: Tables) -> tuple[list[tuple[str, float]], pd.DataFrame]:
     """The final ranking, and ``n`` with one column for each entry: the posterior after each crossing line."""
-    settings = stored_settings(session)
-    return _recognised(dictionary_with(stored_shape(session), settings), settings, tables)
+    found = recognition_of(session, tables)
+    return found.ranking, found.posteriors
 
 
-def _recognised(
-    dictionary: dict[str, Shape], settings: Settings, tables: Tables
-) -> tuple[list[tuple[str, float]], pd.DataFrame]:
-    recogniser = recogniser_for(dictionary, settings)
-    rows: list[dict[str, float]] = []
-    counted = _counted(tables)[["whole", "k", "l1_cm", "l3_cm3", "weight"]]
-    for n, (whole, k, l1_cm, l3_cm3, weight) in enumerate(counted.itertuples(index=False), start=1):
-        if whole:
-            recogniser.update(k, l1_cm, l3_cm3, weight)
-        rows.append({"n": n, **recogniser.posterior()})
-    return recogniser.ranked(), pd.DataFrame(rows, columns=["n", *recogniser.names])
+def recognition_of(session: SessionReader, tables: Tables, collection: str | None = None) -> Recognition:
+    """What a stored session's lines say; with a ``collection``, of that one's entries alone."""
+    settings, shape = stored_settings(session), stored_shape(session)
+    known = load_dictionary(collection, font=settings.font) if collection else dictionary_with(shape, settings)
+    return _recognised(known, settings, tables, shape.name)
+
+
+def _recognised(dictionary: dict[str, Shape], settings: Settings, tables: Tables, called: str) -> Recognition:
+    return recognise_lines(recogniser_for(dictionary, settings, called=called), _counted(tables))
 
 
 def _counted(tables: Tables) -> pd.DataFrame:
@@ -167,22 +186,42 @@ def _filmed(
     if not segments:
         return None
     calibration = Calibration.from_dict(session.manifest["calibration"]["camera"])
-    track = track_segments(segments, calibration, workers=workers, progress=progress)
-    track = on_host_clock(track, segments)
+    several = len(settings.robots) > 1
+    if several:
+        leds = [LedMark(settings.led_colour(number)) for number in range(len(settings.robots))]
+        # the film's slices follow each other as the runs ended, which is the order of the log
+        slices = {int(line): segments[line] for line in tables.lines["line"] if line in segments}
+        film = track_segments(slices, calibration, robots=len(leds), leds=leds, progress=progress)
+        names = [robot["name"] for robot in session.manifest["devices"]["robots"]]
+        track = attribute(on_host_clock(film, segments), tables.lines, names)
+    else:
+        track = on_host_clock(track_segments(segments, calibration, workers=workers, progress=progress), segments)
     track.to_parquet(session.folder / "track.parquet", index=False)
     counts = tables.lines.loc[tables.lines["counts"], "line"]
-    lines = fit_lines(track)
+    # a run's number tells its robot
+    runs = track.drop(columns="robot") if several else track
+    lines = fit_lines(runs, systematic_cm=systematic_cm(calibration))
     lines = lines[lines["line"].isin(counts) & (lines["reason"] == "")].reset_index(drop=True)
-    crossings = true_crossings(lines, geometry, track=track)
-    invariants = invariants_table(crossings)
+    crossings = true_crossings(lines, geometry, track=runs)
+    if several:
+        found = camera_estimate(lines, crossings, tables.lines)
+        tested = lines_from_the_edge(lines, tables.lines, settings.arena.lines_within)
+    else:
+        found, tested = _estimate(invariants_table(crossings)), lines
     try:
-        isotropy = examine_lines(
-            lines["theta_rad"],
-            lines["p_cm"],
-            lines["length_cm"],
-            settings.arena.lines_within,
-            rng,
-            shortest_cm=SHORTEST_RUN_CM,
+        # interior stops draw lines in proportion to their length, and mean to
+        isotropy = (
+            None
+            if settings.motion.turning is Policy.INTERIOR
+            else examine_lines(
+                tested["theta_rad"],
+                tested["p_cm"],
+                tested["length_cm"],
+                settings.arena.lines_within,
+                rng,
+                chain=tested["line"].map(tables.lines.set_index("line")["robot"]) if several else None,
+                shortest_cm=SHORTEST_RUN_CM,
+            )
         )
     except TooFewLinesError:
         isotropy = None
@@ -190,10 +229,24 @@ def _filmed(
         track,
         lines,
         crossings,
-        match_crossings(tables.crossings, crossings, lines=lines["line"]),
-        _estimate(invariants),
+        match_crossings(
+            tables.crossings,
+            crossings,
+            lines=_unlit_at_their_ends(lines["line"], tables.lines),
+            near=near_chords(lines, geometry),
+        ),
+        found,
         isotropy,
+        tested,
+        straightness(lines),
+        filter_health(track),
     )
+
+
+def _unlit_at_their_ends(numbers: pd.Series[int], runs: pd.DataFrame) -> pd.Series[int]:
+    """The runs whose chords all end at the shape's outline: a chord that the run itself cuts is no measured length."""
+    cut = runs.loc[runs["starts_lit"] | runs["ends_lit"], "line"]
+    return numbers[~numbers.isin(cut)]
 
 
 def on_host_clock(track: pd.DataFrame, segments: Mapping[int, Path]) -> pd.DataFrame:
@@ -206,7 +259,7 @@ def on_host_clock(track: pd.DataFrame, segments: Mapping[int, Path]) -> pd.DataF
 
 
 def summarise(found: Reviewed, result: SessionResult) -> dict[str, Any]:
-    """The figures of a review: robot, camera and truth, chords, isotropy, homogeneity, verdict."""
+    """The figures of a review: robot, camera and truth, chords, isotropy, homogeneity, error budget, verdict."""
     filmed = found.filmed
     match, isotropy = (filmed.match, filmed.isotropy) if filmed else (None, None)
     return {
@@ -217,13 +270,23 @@ def summarise(found: Reviewed, result: SessionResult) -> dict[str, Any]:
         "robot": _figures(found.robot),
         "camera": _figures(filmed.estimate if filmed else None),
         "truth": {"area_cm2": found.shape.area_cm2, "perimeter_cm": found.shape.perimeter_cm},
-        "recognised": {"name": found.ranking[0][0], "posterior": found.ranking[0][1]},
+        "recognised": _named(found.recognition),
         "chords": None if match is None else match.to_dict(),
-        "isotropy": None if isotropy is None else {"p_value": isotropy.isotropy_p, "bias": isotropy.bias},
+        "straightness": filmed.straightness.to_dict() if filmed and filmed.straightness else None,
+        "filter": filmed.health.to_dict() if filmed else None,
+        "isotropy": None if isotropy is None else _isotropy_figures(isotropy, found),
         "homogeneity": None if isotropy is None else {"p_value": isotropy.homogeneity_p},
+        "budget": None if found.budget is None else found.budget.to_dict(),
+        "montecarlo": None if found.montecarlo is None else found.montecarlo.to_dict(),
         "run_lengths": None if found.runs is None else _run_figures(found.runs),
         "verdict": verdict_of(result).headline,
     }
+
+
+def _named(found: Recognition) -> dict[str, Any]:
+    name, posterior = found.ranking[0]
+    unknown = float(found.unknown[-1]) if found.unknown.size else None
+    return {"name": name, "posterior": posterior, "twins": list(found.twins_of(name)), "unknown": unknown}
 
 
 def _figures(found: Estimate | None) -> dict[str, Any] | None:
@@ -236,6 +299,21 @@ def _figures(found: Estimate | None) -> dict[str, Any] | None:
         "sigma_perimeter_cm": found.sigma_perimeter_cm,
         "correlation": found.correlation,
         "lines": found.n,
+    }
+
+
+def _isotropy_figures(isotropy: IsotropyReport, found: Reviewed) -> dict[str, Any]:
+    try:
+        bias = bias_from(isotropy, found.settings.arena.lines_within, found.shape.geometry)
+    except TooFewHitsError:
+        bias = None
+    return {
+        "p_value": isotropy.isotropy_p,
+        "bias": isotropy.bias,
+        "effect": isotropy.effect_dict(),
+        "least_seen": isotropy.least_seen_dict(),
+        "shape_bias": None if bias is None else bias.to_dict(),
+        "verdict": isotropy.verdict if bias is None else f"{isotropy.verdict} {bias.sentence()}",
     }
 
 
@@ -265,9 +343,11 @@ def to_result(found: Reviewed, host: Mapping[str, Any] | None = None) -> Session
         estimates=found.tables.estimates,
         exact=Entry.of(found.titles[name], found.moments[name]),
         dictionary={key: Entry.of(found.titles[key], moments) for key, moments in found.moments.items()},
-        ranking=found.ranking,
+        ranking=found.recognition.ranking,
+        twins=found.recognition.twins_of(found.recognition.ranking[0][0]),
+        unknown=float(found.recognition.unknown[-1]) if found.recognition.unknown.size else 0.0,
         stop_at=found.settings.stop.until or 0.95,
-        posteriors=found.posteriors,
+        posteriors=found.recognition.posteriors,
         band=_band(found.shape.geometry, len(counted), found.settings.seed),
         track=filmed.track if filmed else None,
         true_lines=filmed.lines if filmed else None,
@@ -278,6 +358,8 @@ def to_result(found: Reviewed, host: Mapping[str, Any] | None = None) -> Session
         chords_extra=filmed.match.extra if filmed else None,
         isotropy=_isotropy(filmed, found.settings.arena.lines_within) if filmed else None,
         runs_check=found.runs,
+        budget=found.budget,
+        montecarlo=found.montecarlo,
         session=found.session.folder.name,
         provenance={
             "session": {
@@ -307,7 +389,7 @@ def _isotropy(filmed: Filmed, reachable: Polygon) -> Isotropy | None:
     found = filmed.isotropy
     if found is None:
         return None
-    u, v = LineSpace.of(reachable).uniforms(filmed.lines["theta_rad"], filmed.lines["p_cm"])
+    u, v = LineSpace.of(reachable).uniforms(filmed.tested["theta_rad"], filmed.tested["p_cm"])
     p_values = {_TEST_TITLES.get(test.name, test.name): test.holm_p_value for test in found.tests}
     return Isotropy(u, v, p_values | {"mean run length": found.run_length_p}, found.passed, found.verdict)
 
@@ -331,6 +413,8 @@ def _warnings(found: Reviewed) -> list[str]:
         unseen = int(lines["counts"].sum()) - len(found.filmed.lines)
         if unseen > 0.05 * len(lines):
             said.append(f"The camera could not follow {unseen} of {int(lines['counts'].sum())} runs.")
+        if not found.filmed.health.honest:
+            said.append(f"Of the camera's track: {found.filmed.health.verdict}.")
     return said
 
 

@@ -1,15 +1,11 @@
-"""The compiled loop that looks light up in an image. Numba's decorators carry no types: they stop here."""
-# numba ships no type information, so its decorator's result is cast to the plain signature below
-# pyright: reportUnknownMemberType=false, reportMissingTypeStubs=false, reportUntypedFunctionDecorator=false
+"""The compiled loop that looks light up in an image."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import cast
-
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from lab.base.compiled import compiled
 
 Floats = NDArray[np.float64]
 
@@ -34,9 +30,7 @@ def _sample_plane(
         out[i] = offset + light
 
 
-_Sampler = Callable[[NDArray[np.float32], Floats, Floats, Floats, float, Floats], None]
-
-sample_plane = cast(_Sampler, numba.njit(cache=True, error_model="numpy")(_sample_plane))
+sample_plane = compiled(error_model="numpy")(_sample_plane)
 """Bilinear light under points of a plane.
 
 ``image`` float32 (height, width) with a dark rim of one pixel, ``homography`` (3, 3) from plane cm to the

@@ -1,15 +1,11 @@
-"""How often outlines wind about points: a compiled loop. Numba's decorators carry no types: they stop here."""
-# numba ships no type information, so its decorator's result is cast to the plain signature below
-# pyright: reportUnknownMemberType=false, reportMissingTypeStubs=false, reportUntypedFunctionDecorator=false
+"""How often outlines wind about points: a compiled loop."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import cast
-
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from lab.base.compiled import compiled
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -36,9 +32,7 @@ def _count_turns(rings: Floats, starts: Ints, points: Floats, out: Ints) -> None
                     out[i] -= 1
 
 
-_Counter = Callable[[Floats, Ints, Floats, Ints], None]
-
-count_turns = cast(_Counter, numba.njit(cache=True, nogil=True, error_model="numpy")(_count_turns))
+count_turns = compiled(nogil=True, error_model="numpy")(_count_turns)
 """Add to ``out`` (n,) how often the closed ``rings`` turn counter-clockwise about each of ``points`` (n, 2).
 
 ``rings`` (m, 2) are the vertices end to end, each ring closed; ring i runs from ``starts[i]`` to ``starts[i + 1]``.

@@ -1,6 +1,16 @@
 import pytest
 
 
+def pytest_addoption(parser):
+    parser.addoption("--full", action="store_true", help="run the long proofs (-m slow) with all their sessions")
+
+
+@pytest.fixture(scope="session")
+def full(request):
+    """Whether the long proofs are to be run in full; else they are scaled down to fit into minutes."""
+    return request.config.getoption("--full")
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _no_cache_but_our_own(tmp_path_factory):
     """What tests learn is kept for the run alone; the user's cache is neither read nor written."""

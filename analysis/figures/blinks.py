@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from shapely.geometry import box
 from shapely.geometry.base import BaseGeometry
 
 from analysis.figures import pen
@@ -15,6 +16,9 @@ from analysis.figures.maps import draw_arena, draw_scale, draw_silhouette
 from analysis.figures.style import colour_of
 
 Floats = NDArray[np.float64]
+
+_MOST_COLUMNS = 3
+_ABOUT = 1e-6  # cm
 
 
 def lit_positions(track: pd.DataFrame, *, last_line: int | None = None) -> Floats:
@@ -54,21 +58,24 @@ def blinks_figure(
 ) -> Figure:
     """Draw the blinks over the silhouette, one panel for each N in ``counts`` (None: all lines)."""
     panels = panels_at(track, estimates, counts)
-    width, columns = 7.2, max(len(panels), 1)
+    width, columns = 7.2, max(min(len(panels), _MOST_COLUMNS), 1)
+    rows = max(-(-len(panels) // columns), 1)
     west, south, east, north = _view(geometry, panels[-1][1] if panels else np.empty((0, 2)))
-    figure = pen.new_figure(width, min(width / columns * (north - south) / (east - west), 4.2) + 0.4)
+    figure = pen.new_figure(width, rows * (min(width / columns * (north - south) / (east - west), 4.2) + 0.4))
     colour = colour_of(name)
-    for column, (n, places) in enumerate(panels):
-        axes = figure.add_subplot(1, columns, column + 1)
+    for place, (n, places) in enumerate(panels):
+        axes = figure.add_subplot(rows, columns, place + 1)
         pen.dress_map(axes, title=f"N = {n}")
         axes.set_xlim(west, east)
         axes.set_ylim(south, north)
-        draw_arena(axes, arena)
+        if arena.buffer(_ABOUT).within(box(west, south, east, north)):  # a stray stretch of wall says nothing
+            draw_arena(axes, arena)
         draw_silhouette(axes, geometry, colour)
         # Strokes overlap more and more: the dots shrink so that single runs stay visible as they fill the shape.
-        size = float(np.clip(10000 / max(len(places), 1), 0.6, 5.0))
+        # Below, on smaller maps of a second row, smaller yet.
+        size = float(np.clip(10000 / max(len(places), 1), 0.6 if rows == 1 else 0.15, 5.0))
         pen.dots(axes, places[:, 0], places[:, 1], colour, size=size, alpha=0.7, pixels=True, gid="blinks")
-        if column == 0:
+        if place == 0:
             draw_scale(axes, (west, south, east, north))
     return figure
 

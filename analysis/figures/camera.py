@@ -10,7 +10,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from analysis.figures import pen
+from analysis.figures.agreement import draw_agreement
 from analysis.figures.style import colour_of
+from lab.base.blandaltman import WITHIN_LIMITS
 
 Floats = NDArray[np.float64]
 
@@ -32,7 +34,7 @@ class Agreement:
     @property
     def limits_cm(self) -> tuple[float, float]:
         """Between these, 95 of 100 chords agree."""
-        return self.bias_cm - 1.96 * self.sd_cm, self.bias_cm + 1.96 * self.sd_cm
+        return self.bias_cm - WITHIN_LIMITS * self.sd_cm, self.bias_cm + WITHIN_LIMITS * self.sd_cm
 
 
 def agreement(chord_pairs: pd.DataFrame) -> Agreement | None:
@@ -61,7 +63,6 @@ def chord_pairs_figure(chord_pairs: pd.DataFrame, *, name: str) -> Figure:
     against = figure.add_subplot(1, 2, 1)
     apart = figure.add_subplot(1, 2, 2)
     pen.dress(against, x="chord by the camera (cm)", y="chord by the robot (cm)")
-    pen.dress(apart, x="mean of the two (cm)", y="robot − camera (cm)")
     many = robot.size > 500
     size = float(np.clip(8000 / max(robot.size, 1), 2.0, 12.0))
     longest = 1.04 * float(max(robot.max(initial=1.0), camera.max(initial=1.0)))
@@ -69,32 +70,7 @@ def chord_pairs_figure(chord_pairs: pd.DataFrame, *, name: str) -> Figure:
     pen.dots(against, camera, robot, colour, size=size, alpha=0.55, pixels=many, gid="pairs")
     against.set_xlim(0, longest)
     against.set_ylim(0, longest)
-    pen.dots(apart, (robot + camera) / 2, robot - camera, colour, size=size, alpha=0.55, pixels=many)
-    pen.level(apart, 0.0, pen.MUTED, width=0.8, style="-")
-    found = agreement(chord_pairs)
-    if found is not None:
-        low, high = found.limits_cm
-        pen.level(apart, found.bias_cm, pen.INK, width=1.3, style="-", gid="bias")
-        pen.level(apart, low, pen.INK, width=0.9, gid="low limit")
-        pen.level(apart, high, pen.INK, width=0.9, gid="high limit")
-        bottom, top = apart.get_ylim()
-        free = 0.12 * (top - bottom)
-        apart.set_ylim(bottom - free, top + free)
-        for value, words, up in (
-            (high, f"+1.96 sd: {high:+.2f}", 7),
-            (found.bias_cm, f"mean {found.bias_cm:+.2f}", 7),
-            (low, f"−1.96 sd: {low:+.2f}", -7),
-        ):
-            pen.text(
-                apart,
-                (1.0, value),
-                words.replace("-", "−"),
-                shift=(-2, up),
-                side="right",
-                frame="x axes, y data",
-                halo=True,
-            )
-    apart.set_xlim(0, longest)
+    draw_agreement(apart, robot, camera, colour, size=size)
     return figure
 
 

@@ -79,6 +79,15 @@ def square_with_margins(figure: Figure) -> tuple[Axes, Axes, Axes]:
     return square, over, beside
 
 
+def name_rows(axes: Axes, beside: Axes, names: Sequence[str]) -> None:
+    """Make y of both axes rows 0, 1, … from the top, with their names to the left of the first."""
+    for part in (axes, beside):
+        part.set_yticks(range(len(names)), names)
+        part.set_ylim(len(names) - 0.4, -0.6)
+        part.grid(visible=False, axis="y")
+    beside.tick_params(labelleft=False)
+
+
 def legend_below(figure: Figure, axes: Axes, *, columns: int) -> None:
     """Add a legend of what ``axes`` show under the whole figure."""
     handles, labels = axes.get_legend_handles_labels()

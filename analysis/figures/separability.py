@@ -9,18 +9,15 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.path import Path as MplPath
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
 from analysis.estimate import ellipse
 from analysis.figures import pen
+from analysis.figures.fields import plain_log_ticks
 from analysis.figures.style import colour_of
 from analysis.figures.values import Entry
 
 Floats = NDArray[np.float64]
-
-_TICKS = tuple(step * 10.0**decade for decade in range(-1, 7) for step in (1, 2, 5))
-_FEW_TICKS = 4
 
 
 def separability_figure(
@@ -57,14 +54,7 @@ def separability_figure(
         (axes.yaxis, *_span(corners[:, 1]), axes.set_ylim),
     ):
         limit(low, high)
-        ticks = [tick for tick in _TICKS if low <= tick <= high]
-        if len(ticks) < _FEW_TICKS:
-            rough = (high - low) / 6
-            step = min((tick for tick in _TICKS if tick >= rough), default=rough)
-            ticks = list(np.arange(np.ceil(low / step) * step, high, step))
-        axis.set_major_locator(FixedLocator(ticks))
-        axis.set_major_formatter(FuncFormatter(_plain))
-        axis.set_minor_locator(NullLocator())
+        plain_log_ticks(axis, low, high)
     colours = [colour_of(name) if name in clear else pen.MUTED for name in entries]
     for name, contour, colour in zip(entries, contours, colours, strict=True):
         pen.outline(
@@ -78,10 +68,6 @@ def separability_figure(
     spots = [_spot(point) for point in points]
     pen.spread_labels(axes, spots, [entry.title for entry in entries.values()], colours)
     return figure
-
-
-def _plain(value: float, _position: int | None) -> str:
-    return f"{value:g}"
 
 
 def _span(values: Floats) -> tuple[float, float]:

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from analysis.compare import squared_distance
 from analysis.estimate import Estimate
 from analysis.figures.blinks import blinks_figure, panels_at
+from analysis.figures.budget import budget_figure, name_of
 from analysis.figures.camera import agreement, chord_pairs_figure
 from analysis.figures.chords import Chords, chords_figure
 from analysis.figures.convergence import Convergence, convergence_figure, posterior_figure
@@ -19,7 +20,7 @@ from analysis.figures.plane import plane_figure
 from analysis.figures.values import Entry
 from analysis.invariants import lit_lengths
 from analysis.report.result import SessionResult
-from analysis.report.words import number, p_value, percent, probability
+from analysis.report.words import number, p_value, percent, probability, signed
 
 _PLANE_ENTRIES = 8  # more ellipses than this cover each other
 BLINK_COUNTS: tuple[int | None, ...] = (10, 100, None)
@@ -49,7 +50,17 @@ Maker = Callable[[SessionResult], Panel | LeftOut]
 
 def panels_of(result: SessionResult) -> tuple[list[Panel], list[LeftOut]]:
     """Draw what the session allows, in the report's order."""
-    makers: tuple[Maker, ...] = (_blinks, _plane, _convergence, _posterior, _chords, _camera, _lines, _isotropy)
+    makers: tuple[Maker, ...] = (
+        _blinks,
+        _plane,
+        _convergence,
+        _posterior,
+        _chords,
+        _camera,
+        _lines,
+        _isotropy,
+        _budget,
+    )
     made = [maker(result) for maker in makers]
     return [part for part in made if isinstance(part, Panel)], [part for part in made if isinstance(part, LeftOut)]
 
@@ -192,7 +203,8 @@ def _camera(result: SessionResult) -> Panel | LeftOut:
         f"against their mean, {number(found.bias_cm, 2)} cm on average, 95 % between {number(low, 2)} and "
         f"{number(high, 2)} cm.",
         "Left: points on the dashed line agree; another slope is a wrong speed. Right: the solid line is the mean "
-        "difference, the dashed ones hold 95 % of the chords. A cloud that tilts or widens with length is a speed "
+        "difference, the dashed ones hold 95 % of the chords, grey is how well they are known; a dash-dotted line is "
+        "drawn where the difference changes with length. A cloud that tilts or widens with length is a speed "
         "error, one that is shifted as a whole a threshold or a delay.",
     )
 
@@ -223,4 +235,28 @@ def _isotropy(result: SessionResult) -> Panel | LeftOut:
         f"Square scatter of {found.u.size} runs, direction U against place V, with histograms along both.{smallest}",
         "For isotropic, homogeneous lines the points fill the square evenly and 95 % of the bars end in the grey "
         f"stripes. {found.verdict}",
+    )
+
+
+def _budget(result: SessionResult) -> Panel | LeftOut:
+    title = "Where the errors come from"
+    budget = result.budget
+    if budget is None:
+        return LeftOut(title, "too few lines crossed the shape for an error budget.")
+    largest = budget.largest()
+    told = "no cause stands out of its error" if largest is None else f"the largest cause is {name_of(largest)}"
+    seen = f"{signed(budget.area.seen_percent)} % in A and {signed(budget.perimeter.seen_percent)} % in P"
+    source = (
+        "What is left grey is chance, and what robot and camera do not explain."
+        if budget.filmed
+        else "Without video the causes are predicted, and what is left grey is the remainder."
+    )
+    return Panel(
+        "budget",
+        title,
+        budget_figure(budget, name=result.name),
+        f"Two waterfalls from the truth to what the robot found, {seen}; {told}.",
+        "Each block begins where the one above it ended; its whisker is one standard error, for counting "
+        f"statistics the size that chance makes expected. {source} Look for a coloured block that is longer than "
+        "its whisker and than the whisker of counting statistics: more lines will not mend that.",
     )

@@ -13,6 +13,8 @@ import numpy as np
 import pandas as pd
 from shapely.geometry.base import BaseGeometry
 
+from analysis.bandcheck import MonteCarloCheck
+from analysis.budget import Budget
 from analysis.estimate import Estimate
 from analysis.figures.values import Band, Entry, Isotropy
 from analysis.runlengths import ArenaConsistency, ExpectedBias, RunLengths
@@ -70,6 +72,8 @@ class SessionResult:
         exact: The projected shape's exact A, P and covariance for one line.
         dictionary: Every entry the robot chose among, by name.
         ranking: (name, posterior), the most probable first.
+        twins: Other entries that no lines tell from the leading one.
+        unknown: Probability that the shape is none of the dictionary's.
         stop_at: The posterior at which the session was to stop.
         posteriors: ``n`` and one column for each entry; None where only the leader was kept.
         band: Monte Carlo spread of A(N) and P(N) for the projected shape.
@@ -80,6 +84,8 @@ class SessionResult:
         chords_missed: Chords that only the camera saw; ``chords_extra`` those that only the robot saw.
         isotropy: The tests of the runs' randomness.
         runs_check: What the robot's own runs say of its turning.
+        budget: Where the errors of A and P come from; None with too few lines.
+        montecarlo: The curves and chords against simulated sessions; None where they cannot be compared.
         session: The session folder's name.
         provenance: Section -> what -> value: seed, settings, versions, devices, host figures.
         warnings: What the session wants the reader to know, a sentence each.
@@ -95,6 +101,8 @@ class SessionResult:
     exact: Entry
     dictionary: Mapping[str, Entry] = field(default_factory=dict[str, Entry])
     ranking: Sequence[tuple[str, float]] = ()
+    twins: Sequence[str] = ()
+    unknown: float = 0.0
     stop_at: float = 0.95
     posteriors: pd.DataFrame | None = None
     band: Band | None = None
@@ -107,6 +115,8 @@ class SessionResult:
     chords_extra: int | None = None
     isotropy: Isotropy | None = None
     runs_check: RunCheck | None = None
+    budget: Budget | None = None
+    montecarlo: MonteCarloCheck | None = None
     session: str = ""
     provenance: Mapping[str, Mapping[str, object]] = field(default_factory=dict[str, "Mapping[str, object]"])
     warnings: Sequence[str] = ()

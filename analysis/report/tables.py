@@ -9,12 +9,14 @@ from typing import cast
 import numpy as np
 import pandas as pd
 
+from analysis.budget import Budget
 from analysis.compare import deviation
 from analysis.estimate import Estimate
+from analysis.figures.budget import name_of
 from analysis.figures.camera import agreement
 from analysis.report.result import SessionResult
 from analysis.report.verdict import lines_to_tell_apart
-from analysis.report.words import number, p_value, percent, plus_minus, probability, signed
+from analysis.report.words import number, p_value, percent, plus_minus, probability, signed, signed_with
 
 _MOST_ENTRIES = 12
 
@@ -43,7 +45,11 @@ def tables_of(result: SessionResult) -> list[Table]:
         note = "After correction for the number of tests. Below 0.05 the runs are not random enough."
         tables.append(Table("isotropy", "Tests of the runs' randomness", ("test", "p-value"), rows, note))
     chords = _chords(result)
-    return tables if chords is None else [*tables, chords]
+    if chords is not None:
+        tables.append(chords)
+    if result.budget is not None:
+        tables.append(_budget(result.budget))
+    return tables
 
 
 def _sizes(result: SessionResult, measured: Estimate) -> Table:
@@ -133,6 +139,26 @@ def _chords(result: SessionResult) -> Table | None:
     if result.chords_extra is not None:
         rows.append(("chords only the robot saw", str(result.chords_extra)))
     return Table("chords", "Robot against camera, chord by chord", ("", "value"), tuple(rows))
+
+
+def _budget(budget: Budget) -> Table:
+    rows = [
+        (
+            name_of(area.term),
+            signed_with(area.percent, area.sigma_percent),
+            signed_with(perimeter.percent, perimeter.sigma_percent),
+            area.how,
+        )
+        for area, perimeter in zip(budget.area.terms, budget.perimeter.terms, strict=True)
+    ]
+    rows.append(("seen", signed(budget.area.seen_percent), signed(budget.perimeter.seen_percent), "robot − truth"))
+    closed = "It adds up to what was seen, within its errors." if budget.closes else "It does NOT add up within 3 σ."
+    counted = " and ".join(
+        f"{number(abs(side.counting_sigmas))} σ in {name}"
+        for name, side in (("A", budget.area), ("P", budget.perimeter))
+    )
+    note = f"Per cent of the truth, ± one standard error. {closed} Counting statistics is off by {counted}."
+    return Table("budget", "Error budget", ("term", "A (%)", "P (%)", "how"), tuple(rows), note)
 
 
 def provenance_of(result: SessionResult) -> list[Table]:

@@ -8,12 +8,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.budget import Budget, Side
 from analysis.compare import deviation, squared_distance
 from analysis.estimate import Estimate
+from analysis.figures.budget import name_of
 from analysis.figures.camera import Agreement, agreement
 from analysis.figures.values import Entry
 from analysis.report.result import SessionResult
-from analysis.report.words import count, number, p_value, percent, plus_minus, probability, signed
+from analysis.report.words import count, number, p_value, percent, plus_minus, probability, signed, signed_with
 
 Floats = NDArray[np.float64]
 Tone = Literal["good", "fair", "poor"]
@@ -21,6 +23,7 @@ Tone = Literal["good", "fair", "poor"]
 UNLIKELY = 0.01  # a joint deviation rarer than this is a bias, not chance
 SCALE_TOLERANCE = 0.01
 MISSED_TOLERANCE = 0.02
+BUDGET_TOLERANCE = 1.0  # per cent of A or P that is worth a cure
 FEW_LINES = 100  # below, the estimates of intricate shapes are skewed and a Gaussian ellipse only a rough guide
 
 
@@ -97,10 +100,17 @@ def verdict_of(result: SessionResult) -> Verdict:
         _recognition(result, measured),
         *_sizes(result, measured),
         _camera(result, measured),
+        *_against_simulation(result),
         _randomness(result),
         *_turning(result),
+        *_budget(result),
     )
-    problems = [*_of_the_recognition(result, measured), *_of_the_sizes(result, measured), *_of_the_runs(result)]
+    problems = [
+        *_of_the_recognition(result, measured),
+        *_of_the_sizes(result, measured),
+        *_of_the_runs(result),
+        *_of_the_budget(result),
+    ]
     if tone == "good" and problems:
         tone = "fair"
     return Verdict(tone, headline, findings, tuple(problems))
@@ -111,7 +121,12 @@ def _headline(result: SessionResult, measured: Estimate) -> tuple[Tone, str]:
     if not result.ranking:
         return "fair", f"Measured after {lines}; there was no dictionary to recognise the shape from."
     best, posterior = result.ranking[0]
-    title = result.title_of(best)
+    title = " or ".join(map(result.title_of, (best, *result.twins)))
+    if result.unknown > 0.5:
+        known = result.name in {name for name, _ in result.ranking}
+        said = f"Unknown: none of the dictionary's shapes (probability {probability(result.unknown)}) after {lines}"
+        nearest = f"the nearest is {title}"
+        return ("poor", f"{said}; {result.title} was projected.") if known else ("good", f"{said}; {nearest}.")
     if result.name not in {name for name, _ in result.ranking}:
         return "fair", f"{result.title} is not in the dictionary; after {lines} the robot takes it for: {title}."
     sure = probability(posterior)
@@ -183,6 +198,11 @@ def _camera(result: SessionResult, measured: Estimate) -> Finding:
     return Finding("Camera", " ".join(sentences))
 
 
+def _against_simulation(result: SessionResult) -> tuple[Finding, ...]:
+    check = result.montecarlo
+    return () if check is None else (Finding("Against Monte Carlo", check.sentence),)
+
+
 def _randomness(result: SessionResult) -> Finding:
     if result.isotropy is None:
         return Finding("Randomness", "Whether the lines were isotropic was not tested, for want of tracked lines.")
@@ -202,6 +222,74 @@ def _turning(result: SessionResult) -> tuple[Finding, ...]:
         check.lengths.verdict if check.consistency is None else f"{check.lengths.verdict} {check.consistency.verdict}"
     )
     return (Finding("The robot's own runs", said),)
+
+
+_CURES = {
+    "speed": "Calibrate the robot on this floor (`chordlab calibrate robot`); where runs differ from each other, take "
+    'lengths from the wheels (`motion.length_from = "odometry"`).',
+    "latency": "Measure the robot's delays (`chordlab robot characterise`) and roll more slowly.",
+    "sampling": "Roll more slowly or shorten `sensor.interval_s`: chords shorter than one step are lost.",
+    "footprint": "Focus the projector or show the shape larger; recognition by lines matched to the sensor is not "
+    "affected.",
+    "parallax": "Calibrate the projector for the sensor's plane (`chordlab calibrate projector`) and measure "
+    "`sensor.height_cm`.",
+    "anisotropy": "Turn by the cosine law at the wall (`motion.turning`) and check the bumps' directions.",
+}
+
+
+def _budget(result: SessionResult) -> tuple[Finding, ...]:
+    budget = result.budget
+    if budget is None:
+        return ()
+    parts = " and ".join(
+        f"{signed(side.seen_percent)} % in {name}, of which chance is {_chance(side)}" for name, side in _sides(budget)
+    )
+    largest = budget.largest()
+    if largest is None:
+        cause = "No systematic cause stands out of its error: more lines make it better."
+    else:
+        cause = f"The largest systematic cause is {name_of(largest)} ({_part(budget, largest)}). {_CURES[largest]}"
+    how = "" if budget.filmed else " Without video the causes are only predicted."
+    return (Finding("Error budget", f"{parts}. {cause}{how}"),)
+
+
+def _sides(budget: Budget) -> tuple[tuple[str, Side], ...]:
+    return ("A", budget.area), ("P", budget.perimeter)
+
+
+def _chance(side: Side) -> str:
+    term = side.of("counting")
+    return "unknown" if term is None else f"{signed(term.percent)} ({number(term.sigma_percent)} expected)"
+
+
+def _part(budget: Budget, name: str) -> str:
+    terms = [(quantity, side.of(name)) for quantity, side in _sides(budget)]
+    return ", ".join(
+        f"{signed_with(term.percent, term.sigma_percent)} % of {quantity}"
+        for quantity, term in terms
+        if term is not None
+    )
+
+
+def _of_the_budget(result: SessionResult) -> list[Problem]:
+    """What no other check looks for: an image of the wrong size, delays, and errors without a known cause."""
+    budget = result.budget
+    if budget is None or not budget.filmed:
+        return []
+    problems: list[Problem] = []
+    for name in ("latency", "parallax"):
+        terms = [term for _, side in _sides(budget) if (term := side.of(name)) is not None]
+        if any(abs(term.percent) > max(BUDGET_TOLERANCE, 3 * term.sigma_percent) for term in terms):
+            problems.append(Problem(f"A and P are off by {name}: {_part(budget, name)}.", _CURES[name]))
+    if not budget.closes:
+        problems.append(
+            Problem(
+                "The error budget does not add up to what was seen: something is wrong that it does not know of.",
+                "Look at the chords that robot and camera disagree on; check the camera's calibration and that nothing "
+                "was moved during the session.",
+            )
+        )
+    return problems
 
 
 def _of_the_recognition(result: SessionResult, measured: Estimate) -> list[Problem]:

@@ -37,6 +37,12 @@ def plus_minus(value: float, sigma: float, unit: str) -> str:
     return f"{number(value, digits)} ± {number(sigma, digits)} {unit}"
 
 
+def signed_with(value: float, sigma: float) -> str:
+    """Write a signed value ± σ with one or two decimals: ``signed_with(6.098, 0.37)`` is "+6.1 ± 0.4"."""
+    digits = 1 if sigma >= 0.1 else 2
+    return f"{signed(value, digits)} ± {number(sigma, digits)}"
+
+
 def percent(share: float, digits: int = 1) -> str:
     """Write a share in per cent."""
     return f"{number(100 * share, digits)} %"

@@ -7,9 +7,13 @@ from typing import Annotated
 
 import numpy as np
 import typer
+from shapely.geometry import Polygon
 
+from analysis.exploration import Turning, disc_arena, explore, rectangle_arena
 from analysis.montecarlo import simulate as simulate_runs
 from analysis.quadrature import exact_moments
+from analysis.sensor import SensorModel
+from lab.base.errors import RequestError
 from lab.cli.output import JsonFlag, emit, progress_bar, say, show_table
 from lab.cli.shapes import FontOption, ShapeArgument
 from projector.dictionary import shape_from
@@ -33,6 +37,18 @@ def simulate(
     lines: Annotated[int, typer.Option(min=2, max=10_000_000, help="Crossing lines N in each run.")] = 1000,
     runs: Annotated[int, typer.Option(min=1, max=1_000_000, help="Independent runs.")] = 1000,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random lines.")] = 1,
+    arena: Annotated[
+        str | None,
+        typer.Option(
+            help="Roll robots from edge to edge of an arena about the origin, in cm: 60 for a disc of that radius, "
+            "120x90 for a rectangle. Without it lines are independent, uniform and isotropic."
+        ),
+    ] = None,
+    turning: Annotated[Turning, typer.Option(help="How the robots turn at the arena's edge.")] = Turning.LAMBERT,
+    step_cm: Annotated[
+        float | None, typer.Option(min=0, help="Read the light every so many cm of the arena's runs, not everywhere.")
+    ] = None,
+    footprint_cm: Annotated[float, typer.Option(min=0, help="Radius of floor that the light is averaged over.")] = 0.0,
     font: FontOption = None,
     as_json: JsonFlag = False,
 ) -> None:
@@ -40,10 +56,26 @@ def simulate(
 
     Example: chordlab simulate eiffel --lines 300 --runs 1000 --seed 1
     """
+    sensor = None if step_cm is None else SensorModel(step_cm, footprint_cm)
+    if arena is None and (sensor is not None or turning is not Turning.LAMBERT):
+        raise RequestError("a way of turning and a light sensor need an arena: add --arena 60 or --arena 120x90")
     drawn = shape_from(shape, font=font)
     started_s = time.perf_counter()
     with progress_bar("runs", quiet=as_json) as update:
-        result = simulate_runs(drawn.geometry, lines=lines, runs=runs, rng=np.random.default_rng(seed), progress=update)
+        rng = np.random.default_rng(seed)
+        if arena is None:
+            result = simulate_runs(drawn.geometry, lines=lines, runs=runs, rng=rng, progress=update)
+        else:
+            result = explore(
+                drawn.geometry,
+                _arena(arena),
+                lines=lines,
+                runs=runs,
+                rng=rng,
+                turning=turning,
+                sensor=sensor,
+                progress=update,
+            )
     elapsed_s = time.perf_counter() - started_s
     rate = lines * runs / elapsed_s
     if as_json:
@@ -59,3 +91,16 @@ def simulate(
         [(name, f"{true:.2f}", f"{found.mean():.2f}", f"{found.std():.2f}") for name, true, found in rows],
     )
     say(f"{rate:.3g} lines/s")
+
+
+def _arena(text: str) -> Polygon:
+    """The arena of ``--arena``: a radius, or width x height, in cm."""
+    try:
+        sides = [float(side) for side in text.lower().split("x")]
+    except ValueError:
+        sides = []
+    if len(sides) == 1:
+        return disc_arena(sides[0])
+    if len(sides) == 2:
+        return rectangle_arena(*sides)
+    raise RequestError(f"`--arena {text}` is neither a radius nor width x height in cm: give 60 or 120x90")

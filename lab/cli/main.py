@@ -10,7 +10,23 @@ import typer
 from typer.exceptions import TyperException
 
 from lab.base.errors import ChordlabError
-from lab.cli import batch, calibrate, characterise, doctor, geometry, project, robot, run, shapes, track, validate
+from lab.cli import (
+    batch,
+    calibrate,
+    characterise,
+    classes,
+    doctor,
+    figures,
+    geometry,
+    plan,
+    project,
+    recognize,
+    robot,
+    run,
+    shapes,
+    track,
+    validate,
+)
 from lab.cli.output import complain
 
 app = typer.Typer(
@@ -22,9 +38,12 @@ app = typer.Typer(
 )
 app.command("run")(run.run)
 app.command("validate")(validate.validate)
-app.command("recognize")(validate.recognize)
+app.command("recognize")(recognize.recognize)
 app.command("finalize")(validate.finalize)
 app.command("batch")(batch.batch)
+app.command("figures")(figures.figures)
+app.command("classes")(classes.classes)
+app.command("plan")(plan.plan)
 app.command("track")(track.track)
 app.command("moments")(geometry.moments)
 app.command("simulate")(geometry.simulate)
@@ -52,7 +71,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
     except BrokenPipeError:  # the reader of our output left
         return 1
-    return 1 if code == 130 else int(code or 0)  # typer returns 130 for Ctrl-C
+    if code == 130:  # what typer makes of Ctrl-C
+        complain("chordlab: interrupted")
+        return 1
+    return int(code or 0)
 
 
 def entry() -> None:

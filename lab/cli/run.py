@@ -16,7 +16,9 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+from lab.base.errors import RequestError
 from lab.cli.output import JsonFlag, complain, emit, progress_bar, say
+from lab.cli.recognize import read_letters
 from lab.experiment import Finished, run_experiment
 from lab.finalize import finalize
 from lab.ledger import Progress as Step
@@ -24,6 +26,8 @@ from lab.ledger import Watcher
 from lab.review import review
 from lab.settings import Settings, load_settings
 from lab.store import write_checksums
+from projector.collections import charter_words
+from projector.text import TEXT_PREFIX
 
 
 def run(
@@ -41,6 +45,9 @@ def run(
     until: Annotated[float | None, typer.Option(help="Stop once the leading posterior reaches this.")] = None,
     seed: Annotated[int | None, typer.Option(help="Everything random follows from it.")] = None,
     out: Annotated[Path | None, typer.Option(help="Where the session folder goes.")] = None,
+    letters: Annotated[
+        bool, typer.Option("--letters", help="Letter by letter: a session for each letter of text:WORD, then the word.")
+    ] = False,
     no_video: Annotated[bool, typer.Option("--no-video", help="Without a camera.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Only the report's path, and errors.")] = False,
     as_json: JsonFlag = False,
@@ -56,16 +63,29 @@ def run(
         {
             "robot": robot or None,
             "shape": shape,
-            "dictionary": dictionary,
+            "dictionary": dictionary or ("letters" if letters else None),
             "stop.lines": lines,
             "stop.until": until,
             "seed": seed,
             "out": out,
         },
     )
-    hushed = quiet or as_json
+    if letters:
+        _run_letters(settings, quiet=quiet, as_json=as_json)
+        return
+    finished, summary, ratios = _run_one(settings, quiet=quiet or as_json)
+    if as_json:
+        emit({**summary, **ratios, "folder": finished.folder})
+    else:
+        _tell(summary, ratios, quiet=quiet)
+    if finished.failure is not None:
+        raise typer.Exit(1)
+
+
+def _run_one(settings: Settings, *, quiet: bool) -> tuple[Finished, dict[str, Any], dict[str, float]]:
+    """One session and its review: how it ended, its figures, and how fast the virtual bench was."""
     began_s = time.perf_counter()
-    with _session_bar(settings, quiet=hushed) as (watch, tell):
+    with _session_bar(settings, quiet=quiet) as (watch, tell):
         finished = run_experiment(settings, started=datetime.now(), watch=watch, say=tell)
     rolled_s = time.perf_counter() - began_s
     if finished.failure is not None:
@@ -77,21 +97,39 @@ def run(
         )
         raise typer.Exit(1)
     ratios = _ratios(finished, settings, rolled_s)
-    with progress_bar("tracking the video", quiet=hushed) as update:
+    with progress_bar("tracking the video", quiet=quiet) as update:
         summary = review(finished.folder, report=True, host=ratios, progress=update)
     write_checksums(finished.folder)
     summary["seconds"] = time.perf_counter() - began_s
     summary["peak_memory_mb"] = _peak_memory_mb()
-    if as_json:
-        emit({**summary, **ratios, "folder": finished.folder})
-    else:
-        if not quiet:
-            say(str(summary["verdict"]))
-            for name, value in ratios.items():
-                say(f"{name.replace('_', ' ')}: {value:.1f}")
-        say(str(summary["report"]))
-    if finished.failure is not None:
-        raise typer.Exit(1)
+    return finished, summary, ratios
+
+
+def _run_letters(settings: Settings, *, quiet: bool, as_json: bool) -> None:
+    """A session for each letter of the word, in a folder of the word's name; then what they spell."""
+    word = settings.shape.removeprefix(TEXT_PREFIX)
+    if word == settings.shape or len(word) < 2:
+        raise RequestError(f"--letters is for a word: give --shape {TEXT_PREFIX}WORD")
+    folders: list[Path] = []
+    for place, letter in enumerate(word):
+        own = settings.model_copy(
+            update={"shape": TEXT_PREFIX + letter, "seed": settings.seed + place, "out": settings.out / word}
+        )
+        finished, summary, ratios = _run_one(own, quiet=quiet or as_json)
+        folders.append(finished.folder)
+        if not as_json:
+            _tell(summary, ratios, quiet=quiet)
+        if finished.failure is not None:
+            raise typer.Exit(1)
+    read_letters(folders, charter_words(), settings.dictionary, as_json=as_json)
+
+
+def _tell(summary: dict[str, Any], ratios: dict[str, float], *, quiet: bool) -> None:
+    if not quiet:
+        say(str(summary["verdict"]))
+        for name, value in ratios.items():
+            say(f"{name.replace('_', ' ')}: {value:.1f}")
+    say(str(summary["report"]))
 
 
 def _settings(session: Path | None, simulate: bool, no_video: bool, flags: dict[str, Any]) -> Settings:
@@ -149,7 +187,7 @@ def _session_bar(settings: Settings, *, quiet: bool) -> Generator[tuple[Watcher,
                 text = (
                     f"A {_with_error(step.area_cm2, step.sigma_area_cm2)} cm²  "
                     f"P {_with_error(step.perimeter_cm, step.sigma_perimeter_cm)} cm  "
-                    f"{step.leading} {step.posterior:.2f}  battery {step.battery_v:.2f} V"
+                    f"{_leading(step)}  battery {step.battery_v:.2f} V"
                 )
             bar.update(task, completed=step.n, description=text)
             tenth = 10 * step.n // settings.stop.lines
@@ -161,6 +199,12 @@ def _session_bar(settings: Settings, *, quiet: bool) -> Generator[tuple[Watcher,
             console.print(text, markup=False, highlight=False, soft_wrap=True)
 
         yield watch, tell
+
+
+def _leading(step: Step) -> str:
+    if step.unknown > 0.5:
+        return f"none of these {step.unknown:.2f}"
+    return f"{step.leading} {step.posterior:.2f}"
 
 
 def _with_error(value: float, sigma: float) -> str:

@@ -18,6 +18,7 @@ from lab.cli.choosing import (
     picture_path,
 )
 from lab.cli.output import JsonFlag, emit, say, show_table
+from lab.cli.reading import show_reading
 from lab.cli.separability import show_separability
 from lab.settings import ArenaSettings
 from projector.collections import DRAWN, PAPER, drawn_files
@@ -148,6 +149,7 @@ def import_file(
 
 
 app.command("separability")(show_separability)
+app.command("reading")(show_reading)
 
 
 def _figures(shape: Shape) -> dict[str, object]:

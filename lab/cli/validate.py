@@ -1,4 +1,4 @@
-"""`chordlab validate`, `recognize` and `finalize`: a stored session, read again."""
+"""`chordlab validate` and `finalize`: a stored session, read again."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Annotated, Any
 
 import typer
 
-from lab.base.errors import RequestError
+from analysis.figures.budget import name_of
+from analysis.report.words import signed, signed_with
 from lab.cli.output import JsonFlag, emit, progress_bar, say, show_table
 from lab.finalize import finalize as rebuild
-from lab.finalize import tables_of
-from lab.review import recognised, review
-from lab.store import SessionReader, write_checksums
+from lab.review import review
+from lab.store import write_checksums
 
 FolderArgument = Annotated[Path, typer.Argument(metavar="DIR", help="A session folder.")]
 
@@ -45,39 +45,37 @@ def validate(
             f"chords: {chords['matched']} matched, {chords['missed']} missed, {chords['extra']} extra; "
             f"robot − camera {chords['bias_cm']:+.2f} cm, rms {chords['rms_cm']:.2f} cm"
         )
+    for name in ("straightness", "filter"):
+        if summary[name]:
+            say(str(summary[name]["verdict"]))
     for name in ("isotropy", "homogeneity"):
         if summary[name]:
             say(f"{name}: p = {summary[name]['p_value']:.3g}")
+    if summary["isotropy"]:
+        say(str(summary["isotropy"]["verdict"]))
+    if summary["budget"]:
+        _show_budget(summary["budget"])
+    if summary["montecarlo"]:
+        say(f"Monte Carlo: {summary['montecarlo']['sentence']}")
     say(str(summary["verdict"]))
     if summary["report"]:
         say(str(summary["report"]))
 
 
-def recognize(
-    folder: FolderArgument,
-    steps: Annotated[int, typer.Option(min=1, help="Rows to show, spread over the session.")] = 12,
-    as_json: JsonFlag = False,
-) -> None:
-    """The posterior over the dictionary, as lines arrive.
-
-    Example: chordlab recognize sessions/2026-11-23T1042_eiffel_ab12
-    """
-    session = SessionReader(folder)
-    ranking, posteriors = recognised(session, tables_of(session))
-    if posteriors.empty:
-        raise RequestError(f"{folder}: no line crossed the shape, so there is nothing to recognise")
-    if as_json:
-        columns: dict[str, Any] = {str(name): posteriors[name].to_numpy() for name in posteriors}
-        emit({"n": columns.pop("n"), "posterior": columns, "ranking": ranking})
-        return
-    names = [name for name, _ in ranking[:6]]
-    picked = posteriors.iloc[[*range(0, len(posteriors), max(1, len(posteriors) // steps)), len(posteriors) - 1]]
+def _show_budget(budget: dict[str, Any]) -> None:
     rows = [
-        (str(int(row["n"])), *(f"{row[name]:.3f}" for name in names))
-        for _, row in picked.drop_duplicates("n").iterrows()
+        (name_of(area["term"]), _percent(area), _percent(perimeter))
+        for area, perimeter in zip(budget["area"], budget["perimeter"], strict=True)
     ]
-    show_table("posterior after n lines", ("n", *names), rows)
-    say(f"{ranking[0][0]}: {ranking[0][1]:.4f}")
+    seen = budget["seen_percent"]
+    rows.append(("robot − truth", signed(seen["area"]), signed(seen["perimeter"])))
+    show_table("error budget", ("", "A, %", "P, %"), rows)
+    source = "" if budget["filmed"] else "predicted, for want of a video; "
+    say(f"budget: {source}{'adds up' if budget['closes'] else 'does NOT add up'} to what was seen within its errors")
+
+
+def _percent(term: dict[str, Any]) -> str:
+    return signed_with(term["percent"], term["sigma_percent"])
 
 
 def finalize(folder: FolderArgument, as_json: JsonFlag = False) -> None:

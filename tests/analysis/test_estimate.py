@@ -1,12 +1,17 @@
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 import shapely
+import shapely.geometry
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from shapely.geometry import Polygon
 
 from analysis.estimate import (
+    Estimate,
     NoLinesError,
     ellipse,
     estimate,
@@ -151,6 +156,55 @@ def test_95_percent_ellipse_holds_95_percent_of_the_runs(shapes, name, rng):
 def test_95_percent_ellipse_for_every_shape(shapes, lines, rng):
     for name, geometry in shapes.items():
         assert 0.93 < coverage(geometry, lines, 6000, rng) < 0.97, name
+
+
+SIX = ["circle", "square", "triangle", "chichen_itza", "eiffel", "liberty"]
+COVERAGE_RUNS = 3000  # each checked to ±0.4 %
+
+
+def six_shape(name):
+    """One of the paper's shapes, read without the dictionary's code."""
+    file = Path(__file__).parents[2] / "data" / "shapes" / f"{name}.geojson"
+    found = json.loads(file.read_text(encoding="utf-8"))
+    return shapely.geometry.shape(found["geometry"] if "geometry" in found else found["features"][0]["geometry"])
+
+
+@pytest.mark.parametrize("name", SIX)
+def test_95_percent_regions_of_the_six_shapes_at_300_lines(name, rng):
+    """Both kinds: the exact ellipse about the truth, for a dictionary, and each run's own region about its estimate."""
+    geometry = six_shape(name)
+    assert 0.93 < coverage(geometry, 300, COVERAGE_RUNS, rng) < 0.97
+    columns = [column.reshape(COVERAGE_RUNS, 300) for column in simulate_lines(geometry, 300 * COVERAGE_RUNS, rng)]
+    held = [estimate(*run).holds(geometry.area, geometry.length, 0.95) for run in zip(*columns, strict=True)]
+    assert 0.93 < np.mean(held) < 0.97
+
+
+def test_a_region_is_the_outline_of_what_it_holds(shapes, rng):
+    found = estimate(*simulate_lines(shapes["tower"], 40, rng))
+    area, perimeter = found.region(0.9)
+    assert (area[0], perimeter[0]) == pytest.approx((area[-1], perimeter[-1]))
+    assert (area > 0).all()
+    for a, p in zip(area[::9], perimeter[::9], strict=True):
+        inside, outside = (
+            (found.area_cm2 * (a / found.area_cm2) ** s, found.perimeter_cm * (p / found.perimeter_cm) ** s)
+            for s in (0.999, 1.001)
+        )
+        assert found.holds(*inside, 0.9)
+        assert not found.holds(*outside, 0.9)
+    with pytest.raises(RequestError, match="at least 3"):
+        estimate([1, 1], [2.0, 1.0], [8.0, 1.0]).region(0.9)
+    with pytest.raises(RequestError, match="level"):
+        found.holds(1.0, 1.0, 95)
+
+
+def test_a_region_of_normal_logs_holds_its_share(rng):
+    """Hotelling's T²: with 12 lines the χ² ellipse would hold only 89 %."""
+    held = []
+    for _ in range(4000):
+        logs = rng.multivariate_normal([0, 0], [[1.0, 0.6], [0.6, 0.8]], 12) * 1e-3
+        size, spread = np.exp(logs.mean(axis=0)), np.cov(logs, rowvar=False) / 12
+        held.append(Estimate(12, *size.tolist(), spread * np.outer(size, size)).holds(1.0, 1.0, 0.95))
+    assert np.mean(held) == pytest.approx(0.95, abs=0.012)
 
 
 @pytest.mark.parametrize("level", [0.75, 0.95, 0.99])

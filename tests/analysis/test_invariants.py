@@ -165,15 +165,3 @@ def test_compiled_kernels_do_what_their_python_says(lines):
     assert_allclose(out[0], out[1], rtol=1e-12)
     for line, k, l1, l3 in zip(even, *out[1], strict=True):
         assert kernels.chord_invariants.py_func(line, 0, line.size) == pytest.approx((k, l1, l3))
-
-
-def test_kernels_work_where_nothing_can_be_cached(monkeypatch):
-    real = kernels._njit
-
-    def without_cache(**options):
-        if options.get("cache"):
-            raise RuntimeError("cannot cache function: no locator available")
-        return real(**options)
-
-    monkeypatch.setattr(kernels, "_njit", without_cache)
-    assert kernels.kernel(kernels.chord_invariants.py_func)(np.array([0.0, 2.0]), 0, 2) == (1, 2.0, 8.0)

@@ -1,3 +1,5 @@
+import threading
+
 import numpy as np
 import pytest
 import shapely
@@ -6,11 +8,21 @@ from scipy import stats
 from shapely import affinity
 from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
 
-from analysis import montecarlo
+from analysis import linekernels, montecarlo
 from analysis.boundary import Boundary
-from analysis.kernels import available_cores, trace_lines
-from analysis.montecarlo import running_bands, simulate, simulate_chords, simulate_crossings, simulate_lines
+from analysis.invariants import signed_moment
+from analysis.linekernels import LANES
+from analysis.montecarlo import (
+    available_cores,
+    cross_lines,
+    running_bands,
+    simulate,
+    simulate_chords,
+    simulate_crossings,
+    simulate_lines,
+)
 from analysis.quadrature import exact_moments
+from analysis.sensor import SensorModel
 from lab.base.errors import RequestError
 
 
@@ -27,29 +39,94 @@ def random_polygon(seed):
     return shapely.union_all([outer.difference(hole), Point(25, 3).buffer(4, quad_segs=4)])
 
 
+def thrown_with_numpy(boundary, groups, stream):
+    """The same lines from NumPy's own SFC64: (θ, p) about the boundary's centre, in the order thrown."""
+
+    class Given(np.random.bit_generator.ISeedSequence):
+        def __init__(self, words):
+            self.words = words
+
+        def generate_state(self, n_words, dtype=np.uint32):
+            assert (n_words, dtype) == (3, np.uint64)
+            return self.words
+
+    words = stream.integers(0, 1 << 64, (3, LANES), dtype=np.uint64)
+    lanes = [np.random.Generator(np.random.SFC64(Given(np.ascontiguousarray(words[:, i])))) for i in range(LANES)]
+    for _ in range(groups):
+        u = np.array([lane.random() for lane in lanes])
+        v = np.array([lane.random() for lane in lanes])
+        theta = np.where(u < 0.5, np.pi * (u - 0.25), np.pi * (u - 0.75) + np.pi / 2)
+        yield from zip(theta, boundary.radius_cm * (2 * v - 1), strict=True)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_every_line_crosses_where_shapely_says(seed):
+    """Lines from NumPy's generator, cut by shapely, are those of the kernels, crossing by crossing."""
     geometry = random_polygon(seed)
     boundary = Boundary.of(geometry)
-    uniforms = np.random.default_rng(seed).random((400, 2))
-    args = (boundary.x_cm, boundary.y_cm, boundary.chunks, boundary.discs)
-    s, counts = np.empty(20_000), np.empty(400, np.int64)
-    hits, used, filled = trace_lines(uniforms, 400, boundary.radius_cm, args, (s, counts))
-    assert used == 400
-    s2, counts2 = np.empty(20_000), np.empty(400, np.int64)
-    assert trace_lines.py_func(uniforms, 400, boundary.radius_cm, args, (s2, counts2)) == (hits, used, filled)
-    assert_allclose(s2[:filled], s[:filled], atol=1e-9)
-    owned = iter(np.split(s[:filled], np.cumsum(counts[:hits])[:-1]))
+    lines = simulate_crossings(geometry, 300, np.random.default_rng(seed))
+    owned = iter(np.split(lines.s_cm, np.cumsum(lines.counts)[:-1]))
     far = 3 * boundary.radius_cm
-    for u, v in uniforms:
-        theta, p = np.pi * u, boundary.radius_cm * (2 * v - 1)
+    theta_rad, p_cm, expected = [], [], []
+    for theta, p in thrown_with_numpy(boundary, 12, np.random.default_rng(seed).spawn(1)[0]):
         normal, along = np.array([np.cos(theta), np.sin(theta)]), np.array([-np.sin(theta), np.cos(theta)])
         foot = np.array(boundary.centre_cm) + p * normal
         lit = geometry.intersection(LineString([foot - far * along, foot + far * along]))
+        ends = np.sort((shapely.get_coordinates(lit) - foot) @ along) if lit.length else np.empty(0)
+        theta_rad.append(theta)
+        p_cm.append(foot @ normal)
+        expected.append((ends.size // 2, lit.length, signed_moment(ends, 3)))
         if lit.length:
-            ends = np.sort((shapely.get_coordinates(lit) - foot) @ along)
-            assert_allclose(next(owned), ends, atol=1e-8)
+            found = next(owned, None)
+            if found is not None:
+                assert_allclose(found, ends, atol=1e-8)
     assert next(owned, None) is None
+    assert_allclose(np.column_stack(cross_lines(boundary, theta_rad, p_cm)), expected, atol=1e-6)
+
+
+def test_many_words_of_vertices_and_padding():
+    """Outlines of every size about the 63 edges of a word."""
+    for sides in (3, 4, 62, 63, 64, 65, 126, 127, 200):
+        turn = 2 * np.pi * np.arange(sides) / sides
+        ring = np.column_stack([np.cos(turn), np.sin(turn)])
+        disc = Polygon(10 * ring, [4 * ring[::-1]])
+        boundary = Boundary.of(disc)
+        theta = np.random.default_rng(sides).uniform(0, 7, 100)
+        p = np.random.default_rng(sides).uniform(-9, 9, 100)
+        for t, d, k, l1 in zip(theta, p, *cross_lines(boundary, theta, p)[:2], strict=True):
+            n, a = np.array([np.cos(t), np.sin(t)]), np.array([-np.sin(t), np.cos(t)])
+            lit = disc.intersection(LineString([d * n - 30 * a, d * n + 30 * a]))
+            pieces = len(getattr(lit, "geoms", [lit])) if lit.length else 0
+            assert (l1, k) == (pytest.approx(lit.length, abs=1e-9), pieces)
+
+
+def test_kernels_do_what_their_python_says():
+    """In NumPy's own arithmetic, word by word; only the intrinsics stay compiled."""
+    outline = Boundary.of(random_polygon(1)).outline
+    rooms = []
+    for of in (lambda function: function, lambda function: function.py_func):
+        state, work = linekernels.seeded(np.random.default_rng(4)), linekernels.work_for(outline)
+        with np.errstate(over="ignore"):
+            of(linekernels.draw)(state, work.uniform)
+            of(linekernels.directions)(work.uniform, work.cos, work.sin)
+            work.p_cm[:] = np.linspace(-20, 20, LANES)
+            of(linekernels.sign_words)(outline, work)
+        _, crossings = linekernels.list_crossings(outline, work)
+        of(linekernels.place_crossings)(outline, work, crossings)
+        rooms.append((work, crossings))
+    (one, crossings), (two, _) = rooms
+    assert_array_equal(one.signs, two.signs)
+    assert_allclose(one.uniform, two.uniform)
+    assert_allclose(np.hypot(one.cos, one.sin), 1, rtol=1e-15)
+    assert_allclose(one.t_cm[:crossings], two.t_cm[:crossings], atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [2, 4, 6, 8, 15, 16, 18, 300])
+def test_sorting(size, rng):
+    values = rng.normal(size=size + 2)
+    expected = np.concatenate([values[:1], np.sort(values[1:-1]), values[-1:]])
+    linekernels.sort_crossings(values, 1, size)
+    assert_array_equal(values, expected)
 
 
 def test_estimates_scatter_about_the_truth_as_the_quadrature_says(shapes, rng):
@@ -131,23 +208,37 @@ def test_no_crossing_is_dropped_however_many_there_are(rng):
     assert thrown.counts.mean() / 2 == pytest.approx(exact_moments(geometry, tolerance=1e-3).chords_per_line, rel=0.1)
 
 
-def test_small_room_changes_nothing(shapes, monkeypatch):
+def test_small_room_changes_nothing(shapes):
     boundary = Boundary.of(shapes["statue"])
-    whole = montecarlo._trace(boundary, 500, np.random.default_rng(1))
-    stream = np.random.default_rng(1)
-    real = np.empty
+    whole = montecarlo._crossings(boundary, 500, np.random.default_rng(1))
+    state, work = linekernels.seeded(np.random.default_rng(1)), linekernels.work_for(boundary.outline)
+    parts, left = [], 500
+    while left:
+        s_cm, counts = np.empty(LANES * boundary.outline.x_cm.size), np.empty(left, dtype=np.int64)
+        hits, filled = linekernels.fill_crossings(state, boundary.radius_cm, boundary.outline, work, (s_cm, counts))
+        assert 0 < hits <= LANES
+        parts.append((s_cm[:filled].copy(), counts[:hits].copy()))
+        left -= hits
+    assert_array_equal(np.concatenate([s for s, _ in parts]), np.concatenate([part.s_cm for part in whole]))
+    assert_array_equal(np.concatenate([c for _, c in parts]), np.concatenate([part.counts for part in whole]))
 
-    class Tight:
-        def __getattr__(self, name):
-            return getattr(np, name)
 
-        def empty(self, shape, dtype=float):
-            return real(boundary.x_cm.size + 2 if dtype is float and np.isscalar(shape) else shape, dtype)
+def test_what_is_stopped_leaves_nothing(shapes):
+    """Ctrl-C, from the callback or elsewhere, ends the threads, and the next call starts clean."""
+    before = set(threading.enumerate())
 
-    monkeypatch.setattr(montecarlo, "np", Tight())
-    tight = montecarlo._trace(boundary, 500, stream)
-    assert_allclose(tight.s_cm, whole.s_cm)
-    assert_array_equal(tight.counts, whole.counts)
+    def stop(done, total):
+        if done >= total // 10:
+            raise KeyboardInterrupt
+
+    for run in (
+        lambda rng: simulate(shapes["tower"], lines=100_000, runs=20, rng=rng, progress=stop),
+        lambda rng: simulate_lines(shapes["tower"], 2_000_000, rng, progress=stop),
+        lambda rng: SensorModel(2.0).sense(shapes["tower"], 500_000, rng, progress=stop),
+    ):
+        with pytest.raises(KeyboardInterrupt):
+            run(np.random.default_rng(1))
+    assert set(threading.enumerate()) == before
 
 
 def test_running_bands_narrow_like_one_over_root_n(shapes, rng):

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
@@ -8,8 +9,9 @@ from shapely.geometry import MultiPolygon, Point, Polygon, box
 from shapely.ops import unary_union
 
 from analysis.boundary import Boundary, BoundaryError
-from analysis.kernels import direction_integrals
+from analysis.estimate import ratio_bias
 from analysis.quadrature import exact_moments
+from analysis.quadraturekernels import direction_integrals
 from lab.base.errors import RequestError
 
 
@@ -157,15 +159,13 @@ def test_error_is_honest_when_the_work_is_bounded(shapes):
 
 def test_dictionary_keys_of_the_command(shapes):
     moments = exact_moments(shapes["square"])
-    assert list(moments.to_dict()) == [
-        "area_cm2",
-        "perimeter_cm",
-        "hull_perimeter_cm",
-        "chords_per_line",
-        "sigma_area_rel",
-        "sigma_perimeter_rel",
-        "covariance_rel",
-    ]
+    found = moments.to_dict()
+    assert found["correlation"] == pytest.approx(0.03153 / 0.39278 / 0.33730, abs=1e-3)
+    assert found["sigma_area_cm2"] == pytest.approx(0.39278 * 576, rel=1e-4)
+    assert found["sigma_perimeter_cm"] == pytest.approx(0.33730 * 96, rel=1e-4)
+    assert (found["bias_area_rel"], found["bias_perimeter_rel"]) == pytest.approx(
+        tuple(ratio_bias(moments.mean, moments.covariance))
+    )
     assert all(type(value) is float for value in moments.to_dict().values())
     size = np.array([576.0, 96.0])
     assert_allclose(moments.covariance_at(25), moments.relative * np.outer(size, size) / 25, rtol=1e-9)
@@ -194,3 +194,24 @@ def test_the_compiled_kernel_does_what_its_python_says(shapes):
     theta = np.array([0.1, 0.5, 0.51, 2.0])
     compiled = direction_integrals(theta, x, y, previous, following)
     assert_allclose(direction_integrals.py_func(theta, x, y, previous, following), compiled, rtol=1e-11)
+
+
+def test_mean_distance_and_gyration_radius_in_closed_form(shapes):
+    """A square's mean distance (2 + √2 + 5 asinh 1)/15 · a, a disc's 128/(45π) · r; R_g² is a²/6 and r²/2."""
+    square, disc = exact_moments(box(0, 0, 3, 3)), exact_moments(Point(4, 1).buffer(2, quad_segs=400))
+    assert square.mean_distance_cm == pytest.approx(3 * (2 + 2**0.5 + 5 * np.arcsinh(1)) / 15, rel=1e-9)
+    assert square.gyration_radius_cm == pytest.approx(3 / 6**0.5, rel=1e-9)
+    assert disc.mean_distance_cm == pytest.approx(2 * 128 / 45 / np.pi, rel=1e-5)
+    assert disc.gyration_radius_cm == pytest.approx(2**0.5, rel=1e-5)
+
+
+@pytest.mark.parametrize("name", ["ell", "annulus", "two discs", "tower", "statue"])
+def test_gyration_radius_is_that_of_the_triangles_of_the_shape(shapes, name):
+    """∫|v|² over a triangle is its area/12 · (Σ|v_i|² + |Σv_i|²): exact, over a triangulation by shapely."""
+    corners = np.array(
+        [t.exterior.coords[:3] for t in shapely.constrained_delaunay_triangles(shapes[name]).geoms]
+    ) - np.array(shapes[name].centroid.coords[0])
+    area = np.abs(np.cross(*np.diff(np.pad(corners, ((0, 0), (0, 0), (0, 1))), axis=1).swapaxes(0, 1)))[:, 2] / 2
+    second = area / 12 * ((corners**2).sum(axis=(1, 2)) + (corners.sum(axis=1) ** 2).sum(axis=1))
+    assert area.sum() == pytest.approx(shapes[name].area, rel=1e-9)
+    assert exact_moments(shapes[name]).gyration_radius_cm ** 2 == pytest.approx(second.sum() / area.sum(), rel=1e-6)

@@ -8,8 +8,9 @@ from scipy import stats
 from shapely import affinity
 from shapely.geometry import box
 
+from analysis.congruence import congruence_classes
 from analysis.montecarlo import simulate_lines
-from analysis.perline import LineRecogniser, learn_tables
+from analysis.perline import LineRecogniser, learn_tables, tables_of
 from analysis.quadrature import exact_moments
 from analysis.recognition import FIRST_POSTERIOR_N, GaussianRecogniser, Recogniser, Weights
 from analysis.sensor import SensorModel
@@ -295,6 +296,41 @@ def test_shapes_of_one_area_and_perimeter_differ_line_by_line(rng):
     entries = {"ell": ell, "tee": tee}
     recogniser = LineRecogniser(learn_tables(entries, rng))
     assert min(share_right(recogniser, entries, 300, 40, rng).values()) >= 0.9
+
+
+def test_twins_are_one_class(six, rng):
+    """A mirrored tower and the tower share one table, are as probable as each other and lead together."""
+    entries = {"rewot": affinity.scale(affinity.skew(six["tower"], 10), -1, 1), "square": six["square"]}
+    entries["tower"] = affinity.skew(six["tower"], 10)
+    classes = congruence_classes(entries)
+    assert classes == [("rewot", "tower"), ("square",)]
+    seen = {name: simulate_lines(geometry, 20_000, rng) for name, geometry in entries.items()}
+    moments = {name: exact_moments(geometry) for name, geometry in entries.items()}
+    for recogniser in (LineRecogniser(tables_of(seen, classes)), GaussianRecogniser(moments, classes=classes)):
+        assert recogniser.classes == (("rewot", "tower"), ("square",))
+        recogniser.update_many(*simulate_lines(entries["tower"], 150, rng))
+        posterior = recogniser.posterior()
+        assert posterior["tower"] == pytest.approx(posterior["rewot"], rel=1e-6) == pytest.approx(0.5, abs=0.02)
+        assert recogniser.ranked()[0] == ("rewot", pytest.approx(1, abs=0.02))
+        assert len(recogniser.ranked()) == 2
+        assert recogniser.unknown() < 0.5
+    with pytest.raises(RequestError, match="stranger"):
+        tables_of(seen, [("tower", "stranger")])
+
+
+def test_twins_are_found_among_many():
+    """Each of forty polygons has one copy, turned and mirrored, among near copies that are none."""
+    rng = np.random.default_rng(8)
+    entries = {}
+    for number in range(40):
+        angle = np.sort(rng.uniform(0, 2 * np.pi, 7))
+        polygon = shapely.convex_hull(shapely.MultiPoint(20 * np.column_stack([np.cos(angle), np.sin(angle)])))
+        entries[f"one {number}"] = polygon
+        entries[f"near {number}"] = affinity.scale(polygon, 1.02, 1.02)
+        entries[f"other {number}"] = affinity.rotate(affinity.scale(polygon, -1, 1), rng.uniform(0, 360))
+    found = [members for members in congruence_classes(entries) if len(members) > 1]
+    assert found == [(f"one {number}", f"other {number}") for number in range(40)]
+    assert congruence_classes({}) == []
 
 
 @pytest.mark.slow
