@@ -61,7 +61,6 @@ def test_every_command_has_help_with_an_example(say, words):
         (["run", "--simulate", "--lines", "0"], "lines"),
         (["run", "none.toml"], "No such file"),
         (["run", "--simulate", "--shape", "nessie"], "nessie"),
-        (["run", "--robot", "virtual", "--robot", "virtual"], "--no-video"),
         (["run", "--robot", "onboard:virtual", "--robot", "virtual", "--no-video"], "rolls alone"),
         (["run", "--robot", "SB-1234"], "no device"),
         (["validate", "/tmp"], "no session folder"),
