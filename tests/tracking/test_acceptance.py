@@ -24,10 +24,15 @@ FAULTS = {
 }
 
 
+ALWAYS = ("uneven", "all", "grey, all")  # the others are parts of these, and wait for --full
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_film_with_faults_is_tracked_to_a_millimetre(tmp_path, name):
+def test_a_film_with_faults_is_tracked_to_a_millimetre(tmp_path, name, full):
     """720p, 4 px/cm, tilted, noise 2.5, blur over 12 ms, a lit shape, 25 s of rolling."""
+    if not full and name not in ALWAYS:
+        pytest.skip("run with --full")
     rng = np.random.default_rng(11)
     way = wander(rng, (110.0, 66.0), length_cm=700.0)
     camera = CameraSettings(exposure_s=0.012, noise_sigma=2.5)
