@@ -109,9 +109,11 @@ def test_lines_needed_are_those_of_simulated_runs(tables, rates, name):
 def test_a_pairs_random_walk_is_that_of_simulated_runs(tables, rates, pair, confidence):
     row, rival = (list(PAPER).index(name) for name in pair)
     n = rates.pair_lines(row, rival, confidence)
-    _, beaten = wrong_after(tables, GEOMETRIES[pair[0]], row, n, 4000, np.random.default_rng(9))
     # the steps are skewed, and n is a whole number: a few lines are not yet quite normal
-    assert beaten[rival] == pytest.approx(1 - confidence, abs=0.5 * (1 - confidence))
+    _, beaten = wrong_after(tables, GEOMETRIES[pair[0]], row, n, 4000, np.random.default_rng(9))
+    assert beaten[rival] < 1.5 * (1 - confidence)
+    _, beaten = wrong_after(tables, GEOMETRIES[pair[0]], row, int(0.7 * n), 4000, np.random.default_rng(9))
+    assert beaten[rival] > 1 - confidence
 
 
 def test_rates_are_the_mean_and_variance_of_looked_up_lines(tables, rates):
