@@ -72,9 +72,9 @@ def test_false_alarms_are_one_in_twenty(shapes, rng, name, tests):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["independent", "rolled"])
-def test_false_alarms_in_full(shapes, rng, kind):
-    """5 % within 1 % over 2000 sessions, for lines that are independent and for lines from wall to wall."""
-    n, tests = checkpoints_to(60), 2000
+def test_false_alarms_in_full(shapes, rng, kind, full):
+    """5 % within 1 % over 2000 sessions, for lines that are independent and (fewer, but for --full) wall to wall."""
+    n, tests = checkpoints_to(60), 2000 if full or kind == "independent" else 500
 
     def draw(sessions):
         if kind == "independent":
@@ -82,7 +82,8 @@ def test_false_alarms_in_full(shapes, rng, kind):
         return rolled_curves(shapes["tower"], ARENA, n, sessions, rng)
 
     wrong = rejected(draw(tests), lambda: draw(199), tests)
-    assert 0.04 < wrong / tests < 0.06, wrong / tests
+    slack = 0.01 * np.sqrt(2000 / tests)  # two standard errors of a rate from so many
+    assert abs(wrong / tests - 0.05) < slack, wrong / tests
 
 
 def test_lines_from_wall_to_wall_scatter_more_than_independent_ones(shapes, rng):

@@ -76,8 +76,10 @@ def test_two_runs_of_each_shape_are_enough(rng):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("lines", "rand", "v_measure"), [(300, 0.45, 0.8), (1000, 0.7, 0.92)])
-def test_letters_by_their_lines(rng, lines, rand, v_measure):
+def test_letters_by_their_lines(rng, lines, rand, v_measure, full):
     """By (P, A) letters are not to be told apart; five means of the lines sort most of them."""
+    if lines > 300 and not full:
+        pytest.skip("run with --full")
     letters = {
         name: shape.geometry
         for name, shape in load_dictionary("letters").items()
