@@ -73,7 +73,9 @@ def test_letters_are_for_words(told):
 
 
 @pytest.mark.slow
-def test_both_ways_to_read_a_word(told):
+def test_both_ways_to_read_a_word(told, full):
+    if not full:
+        pytest.skip("run with --full")
     code, out, _ = told("shapes", "reading", "NO", "--lines", "100", "--json")
     found = json.loads(out)
     assert code == 0
