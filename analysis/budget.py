@@ -34,8 +34,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.invariants import area_cm2, perimeter_cm
+from analysis.invariants import sizes
 from lab.base.errors import RequestError
+from lab.base.jackknife import jackknife_sigma
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -180,18 +181,6 @@ def groups_of(crossed: NDArray[np.bool_]) -> tuple[Ints, int]:
     groups = min(_MOST_GROUPS, lines // 2)
     before = np.cumsum(crossed) - crossed
     return np.minimum(before * groups // lines, groups - 1).astype(np.int64), groups
-
-
-def sizes(sums: Floats) -> Floats:
-    """(…, 2) of (A in cm², P in cm) from summed (k, 𝓛_1, 𝓛_3) (…, 3)."""
-    k, l1_cm, l3_cm3 = np.moveaxis(sums, -1, 0)
-    return np.stack([area_cm2(l1_cm, l3_cm3), perimeter_cm(k, l1_cm, l3_cm3)], axis=-1)
-
-
-def jackknife_sigma(replicates: Floats) -> Floats:
-    """Standard error (…) of values whose replicates (groups, …) each lack one group of lines."""
-    groups = len(replicates)
-    return np.sqrt((groups - 1) / groups * ((replicates - replicates.mean(axis=0)) ** 2).sum(axis=0))
 
 
 def budget_of(

@@ -6,7 +6,7 @@ twins, a 6 and a 9, cannot be told apart by any line statistics, and make one cl
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import shapely
@@ -39,6 +39,13 @@ def congruence_classes(geometries: Mapping[str, Geometry]) -> list[tuple[str, ..
         same = next((head for head in map(int, alike) if are_congruent(shapes[head], shapes[number])), number)
         classes.setdefault(same, []).append(name)
     return [tuple(members) for members in classes.values()]
+
+
+def rivals_of(classes: Sequence[Sequence[str]], names: Sequence[str]) -> NDArray[np.bool_]:
+    """(names, names) whether taking the first for the second is a mistake: all but the members of one class."""
+    of = {name: number for number, members in enumerate(classes) for name in members}
+    numbers = np.array([of[name] for name in names])
+    return numbers[:, None] != numbers
 
 
 def are_congruent(one: Geometry, other: Geometry) -> bool:

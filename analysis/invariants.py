@@ -147,6 +147,12 @@ def perimeter_cm(mean_k: ArrayLike, mean_l1_cm: ArrayLike, mean_l3_cm3: ArrayLik
         return np.where(l1 > 0, np.pi * area_cm2(l1, mean_l3_cm3) * np.asarray(mean_k, dtype=float) / l1, np.nan)
 
 
+def sizes(sums: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(…, 2) of (A in cm², P in cm) from sums or means (…, 3) of (k, 𝓛_1 in cm, 𝓛_3 in cm³) over lines."""
+    k, l1_cm, l3_cm3 = np.moveaxis(sums, -1, 0)
+    return np.stack([area_cm2(l1_cm, l3_cm3), perimeter_cm(k, l1_cm, l3_cm3)], axis=-1)
+
+
 def _paired(s_cm: ArrayLike, entering: ArrayLike | None = None) -> Floats:
     s = np.ascontiguousarray(np.asarray(s_cm, dtype=float).ravel())
     if s.size % 2:

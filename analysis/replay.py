@@ -14,14 +14,11 @@ from numpy.typing import NDArray
 from analysis.boundary import Boundary, Geometry
 from analysis.kernels import chord_invariants, kernel
 from analysis.sensor import SensorModel
-from analysis.sensorkernels import cross_parallel, detect, read_light
+from analysis.sensorkernels import clear_light, cross_parallel, detect, read_light, room_for
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
-
-_SPARE_READINGS = 8
-_DEEPEST_NOISE = 6.0  # beyond the thresholds by so many noise widths nothing happens that the next would not undo
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -184,17 +181,12 @@ def _read(
 ) -> None:
     offsets_cm, half_cm, weight = footprint
     noise, jitter_cm, late_cm = spread
-    slices = offsets_cm.size
-    t_cm = np.empty((slices, boundary[0].size))
-    counts = np.zeros(slices, np.int64)
     widest_cm = 0.0
     for i in range(boundary[0].size):
         widest_cm = max(widest_cm, np.hypot(boundary[0][i], boundary[1][i]))
-    room = int(2.0 * (widest_cm + 2.0 * half_cm.max()) / steps_cm.min()) + _SPARE_READINGS
-    s_cm = np.empty(room)
-    light = np.empty(room)
-    found_cm = np.empty(room + 1)
-    clear = (levels[0] - _DEEPEST_NOISE * noise, levels[2] + _DEEPEST_NOISE * noise)
+    most = 2.0 * (widest_cm + 2.0 * half_cm.max()) / steps_cm.min()
+    t_cm, counts, s_cm, light, found_cm = room_for(offsets_cm.size, boundary[0].size, most)
+    clear = clear_light(levels, noise)
     for line in range(passes.shape[0]):
         cos, sin, p, low, high = passes[line]
         if cross_parallel((cos, sin, p), offsets_cm, boundary, t_cm, counts) == 0:

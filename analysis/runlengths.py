@@ -22,10 +22,11 @@ from shapely.geometry import Polygon
 
 from analysis.billiard import check_exponent, hit_and_run, roll
 from analysis.boundary import Boundary, Geometry
-from analysis.invariants import area_cm2, perimeter_cm
+from analysis.invariants import sizes
 from analysis.montecarlo import cross_lines
 from analysis.turninglaw import Exponent, LawTable, tabulate_law
 from lab.base.errors import RequestError
+from lab.base.jackknife import jackknife_sigma
 
 Floats = NDArray[np.float64]
 
@@ -267,7 +268,7 @@ def expected_bias(
         sums[row] = _shape_sums(boundary, rolls.theta_rad.ravel(), rolls.p_cm.ravel())
     if not sums[:, 0].all():
         raise RequestError(f"{runs} runs meet this shape too seldom: ask for more, or for a larger shape")
-    size, sigma = _jackknifed(sums, _sizes)
+    size, sigma = _jackknifed(sums, sizes)
     truth = np.array([geometry.area, geometry.length])
     bias, error = (size / truth - 1).tolist(), (sigma / truth).tolist()
     verdict = (
@@ -322,7 +323,7 @@ def arena_consistency(
         return np.stack([area, reachable.length * total[..., 0] / total[..., 4]], axis=-1)
 
     def log_ratio(total: Floats) -> Floats:
-        return np.log(by_arena(total) / _sizes(total))
+        return np.log(by_arena(total) / sizes(total[..., :3]))
 
     logs, sigma = _jackknifed(sums, log_ratio)
     p_values = np.asarray(2 * student.sf(np.abs(logs) / sigma, _BLOCKS - 1), dtype=float)
@@ -361,16 +362,9 @@ def _shape_sums(boundary: Boundary, theta_rad: Floats, p_cm: Floats) -> Floats:
     return np.array([column.sum() for column in cross_lines(boundary, theta_rad, p_cm)], dtype=float)
 
 
-def _sizes(sums: Floats) -> Floats:
-    """(A, P) by Eq. 1 from sums (…, 3 or more) of (k, 𝓛_1, 𝓛_3)."""
-    k, l1, l3 = sums[..., 0], sums[..., 1], sums[..., 2]
-    return np.stack([area_cm2(l1, l3), perimeter_cm(k, l1, l3)], axis=-1)
-
-
 def _jackknifed(sums: Floats, of: Callable[[Floats], Floats]) -> tuple[Floats, Floats]:
     """``of`` the total of the blocks' sums (blocks, c), freed of its bias to first order, and its standard error."""
     blocks = len(sums)
     total = sums.sum(axis=0)
     without = of(total - sums)
-    error = np.sqrt((blocks - 1) / blocks * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
-    return blocks * of(total) - (blocks - 1) * without.mean(axis=0), error
+    return blocks * of(total) - (blocks - 1) * without.mean(axis=0), jackknife_sigma(without)

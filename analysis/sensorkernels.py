@@ -18,6 +18,8 @@ Ints = NDArray[np.int64]
 
 _TRAILING = 2  # readings in the dark after the last ramp: they confirm the last exit
 _SLOWEST = 0.2  # a run's speed, relative to what it should be; keeps its readings countable
+_SPARE_READINGS = 8  # rounding, and those before the first ramp
+_DEEPEST_NOISE = 6.0  # noise widths
 
 
 @kernel
@@ -191,6 +193,28 @@ def detect(s_cm: Floats, light: Floats, readings: int, levels: tuple[float, floa
 
 
 @kernel
+def clear_light(levels: tuple[float, float, float], noise: float) -> tuple[float, float]:
+    """The light below and above which nothing can happen that the next reading would not undo."""
+    return levels[0] - _DEEPEST_NOISE * noise, levels[2] + _DEEPEST_NOISE * noise
+
+
+@kernel
+def room_for(slices: int, vertices: int, readings: float) -> tuple[Floats, Ints, Floats, Floats, Floats]:
+    """Room for one line: (t_cm, counts) of `cross_parallel`, (s_cm, light) of `read_light`, found_cm of `detect`.
+
+    ``readings`` is the most that a line's length holds.
+    """
+    size = int(readings) + _SPARE_READINGS
+    return (
+        np.empty((slices, vertices)),
+        np.zeros(slices, np.int64),
+        np.empty(size),
+        np.empty(size),
+        np.empty(size + 1),
+    )
+
+
+@kernel
 def sense_line(
     rng: np.random.Generator,
     crossings: tuple[Floats, Ints],
@@ -206,8 +230,7 @@ def sense_line(
     """
     step_cm, jitter_cm, speed_sigma = motion
     phase, s_cm, light, found_cm = room
-    # Six noise widths beyond the thresholds nothing can happen that the next reading would not undo.
-    clear = (levels[0] - 6.0 * noise, levels[2] + 6.0 * noise)
+    clear = clear_light(levels, noise)
     speed = max(_SLOWEST, 1.0 + speed_sigma * rng.standard_normal()) if speed_sigma > 0.0 else 1.0
     readings = read_light(crossings, slices, speed * step_cm, phase, clear, s_cm, light)
     last = -np.inf
@@ -245,12 +268,8 @@ def sense_lines(
     offsets_cm, half_cm, weight = footprint
     k, l1_cm, l3_cm3 = seen
     slices = offsets_cm.size
-    t_cm = np.empty((slices, boundary[0].size))
-    counts = np.zeros(slices, np.int64)
-    size = int(2.0 * (extent_cm + half_cm.max()) / (_SLOWEST * motion[0])) + 8
-    s_cm = np.empty(size)
-    light = np.empty(size)
-    found_cm = np.empty(size + 1)
+    longest_cm = 2.0 * (extent_cm + half_cm.max())
+    t_cm, counts, s_cm, light, found_cm = room_for(slices, boundary[0].size, longest_cm / (_SLOWEST * motion[0]))
     excess = np.zeros((2, 3))
     difference = np.empty(3)
     for line in range(k.size):
@@ -292,12 +311,9 @@ def sense_given(
     cos, sin, p_cm = lines
     offsets_cm, half_cm, weight = footprint
     k, l1_cm, l3_cm3 = seen
-    t_cm = np.empty((offsets_cm.size, boundary[0].size))
-    counts = np.zeros(offsets_cm.size, np.int64)
-    size = int(2.0 * (extent_cm + half_cm.max()) / (_SLOWEST * motion[0])) + 8
-    s_cm = np.empty(size)
-    light = np.empty(size)
-    found_cm = np.empty(size + 1)
+    longest_cm = 2.0 * (extent_cm + half_cm.max())
+    most = longest_cm / (_SLOWEST * motion[0])
+    t_cm, counts, s_cm, light, found_cm = room_for(offsets_cm.size, boundary[0].size, most)
     for line in range(k.size):
         k[line] = 0
         l1_cm[line] = 0.0

@@ -76,13 +76,8 @@ def pause_s(settings: Settings) -> float:
     """
     body, profile = BodySettings(), settings.profile()
     turning_s = _MEAN_TURN_RAD / body.turn_rate_rad_s
-    return turning_s + cruising_cm_s(settings) / (2 * body.acceleration_cm_s2) + profile.command_pacing_s
-
-
-def cruising_cm_s(settings: Settings) -> float:
-    """The speed that whole units of the drive command allow."""
-    profile = settings.profile()
-    return profile.speed_units(settings.motion.speed_cm_s) * profile.cm_s_per_unit
+    cruising_cm_s = profile.cruising_cm_s(settings.motion.speed_cm_s)
+    return turning_s + cruising_cm_s / (2 * body.acceleration_cm_s2) + profile.command_pacing_s
 
 
 def charge_s(settings: Settings) -> float:
@@ -110,7 +105,8 @@ def plan(
     """
     reachable, model = settings.arena.lines_within, sensor_model(settings)
     robots = len(settings.robots)
-    pace = Pace.on(reachable, cruising_cm_s(settings), pause_s(settings), robots=robots, diameter_cm=2 * BALL_RADIUS_CM)
+    cruising_cm_s = settings.profile().cruising_cm_s(settings.motion.speed_cm_s)
+    pace = Pace.on(reachable, cruising_cm_s, pause_s(settings), robots=robots, diameter_cm=2 * BALL_RADIUS_CM)
     for shape in shapes:
         if not reachable.covers(shape.geometry):
             raise RequestError(f"{shape.name} reaches out of what the robot can reach; take a larger --arena")

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.confusion import MOST_LINES, LineConfusion, PlaneConfusion, fewest_lines, measure_rates
-from analysis.congruence import congruence_classes
+from analysis.congruence import congruence_classes, rivals_of
 from analysis.perline import learn_tables
 from analysis.quadrature import Moments, exact_moments
 from analysis.sensor import SensorModel
@@ -130,7 +130,7 @@ def separability(
 
     classes = congruence_classes(geometries)
     twins = {name: members for members in classes for name in members}
-    rivals = np.array([[other not in twins[name] for other in names] for name in names])
+    rivals = rivals_of(classes, names)
     moments: dict[str, Moments] = {}
     for name, geometry in geometries.items():
         if model is None:

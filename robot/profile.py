@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import json
 import sys
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 from lab.base.errors import RequestError
 from lab.base.files import write_aside
+from lab.base.given import one_line, read_given, toml_of
 from robot.collision import AXES, check_axes
 from robot.errors import DriveError
 
@@ -134,6 +134,13 @@ class RobotProfile:
         """Speed of the lowest value of the speed byte that rolls."""
         return self.least_speed_units * self.cm_s_per_unit
 
+    def cruising_cm_s(self, speed_cm_s: float) -> float:
+        """The speed that a robot is really told where ``speed_cm_s`` is asked for: its command counts in whole units.
+
+        Raises as ``speed_units``.
+        """
+        return self.speed_units(speed_cm_s) * self.cm_s_per_unit
+
     def speed_units(self, speed_cm_s: float) -> int:
         """The speed byte nearest to ``speed_cm_s``; at least 1 for any speed above 0.
 
@@ -165,21 +172,31 @@ def load_profile(path: Path) -> RobotProfile:
         RequestError: The file cannot be read, is not TOML, or has an unknown key or a bad value.
     """
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise RequestError(f"{path}: {error.strerror or 'cannot be read'}; check the path") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise RequestError(f"{path} is not TOML: {error}") from error
-    known = {field.name for field in fields(RobotProfile)}
-    for key in data:
-        if key not in known:
-            raise RequestError(f"{path}: `{' '.join(key.split())}` is no key of a robot profile; take it out")
-    if isinstance(data.get("collision_axes"), list):
-        data["collision_axes"] = tuple(data["collision_axes"])
+        data = toml_of(read_given(path))
+    except ValueError as error:
+        raise RequestError(one_line(f"{path} is not TOML: {error}")) from error
     try:
-        return RobotProfile(**data)
+        return profile_of(data)
     except RequestError as error:
-        raise RequestError(f"{path}: {error}") from error
+        raise RequestError(one_line(f"{path}: {error}")) from error
+
+
+def profile_of(data: Any) -> RobotProfile:
+    """The profile of plain data, as TOML or JSON has it; keys that it lacks keep their defaults.
+
+    Raises:
+        RequestError: It is no table, or has an unknown key or a bad value.
+    """
+    if not isinstance(data, dict):
+        raise RequestError("a robot profile is a table of keys and values")
+    values = {str(key): value for key, value in cast("dict[Any, Any]", data).items()}
+    known = {field.name for field in fields(RobotProfile)}
+    for key in values:
+        if key not in known:
+            raise RequestError(one_line(f"`{key}` is no key of a robot profile; take it out"))
+    if isinstance(values.get("collision_axes"), list):
+        values["collision_axes"] = tuple(values["collision_axes"])
+    return RobotProfile(**values)
 
 
 def save_profile(profile: RobotProfile, path: Path, comments: Mapping[str, str] = _NO_COMMENTS) -> None:

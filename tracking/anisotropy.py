@@ -26,6 +26,7 @@ from scipy.stats import ncx2
 from shapely import MultiPolygon, Polygon
 
 from lab.base.errors import RequestError
+from lab.base.jackknife import jackknife_sigma
 from tracking.linespace import LineSpace, support
 from tracking.nulltable import CENTRE_PULL, SMOOTH, NullTable
 from tracking.uniformity import smooth_functions, smooth_terms
@@ -288,9 +289,7 @@ def bias_from(report: IsotropyReport, region: Polygon, shape: Polygon | MultiPol
             return np.asarray(np.exp(np.log(np.maximum(1.0 + c @ response.T, 0.01)) @ weights), dtype=float)
 
         # the jackknife by blocks longer than the dependence; it knows the ratio's curvature, too
-        again, blocks = biased(left_out), len(left_out)
-        sigma = float(np.sqrt((blocks - 1) / blocks * np.sum((again - again.mean()) ** 2)))
-        found += [float(biased(coefficients)) - 1.0, sigma]
+        found += [float(biased(coefficients)) - 1.0, float(jackknife_sigma(biased(left_out)))]
     least = [
         float(np.sqrt(evidence.noncentrality * (s @ np.linalg.solve(evidence.information, s))))
         for s in (_AREA @ worst, _PERIMETER @ worst)

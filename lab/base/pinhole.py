@@ -137,7 +137,7 @@ class Pinhole:
             try:
                 array = np.asarray(data[key], dtype=float)
                 array = array.ravel() if shape != (3, 3) else array
-            except (KeyError, TypeError, ValueError) as error:
+            except (KeyError, TypeError, ValueError, OverflowError) as error:
                 raise RequestError(f"calibration: `{key}` is missing or not numbers; calibrate again") from error
             if (shape is not None and array.shape != shape) or not np.isfinite(array).all():
                 raise RequestError(f"calibration: `{key}` must be finite numbers of shape {shape}, got {array.shape}")
@@ -147,7 +147,7 @@ class Pinhole:
         size: Any = data.get("image_size")
         try:
             width_px, height_px = (int(value) for value in size)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise RequestError("calibration: `image_size` must be [width, height] in pixels") from error
         if width_px <= 0 or height_px <= 0:
             raise RequestError("calibration: `image_size` must be above 0 pixels")

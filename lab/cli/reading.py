@@ -3,29 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import typer
 
-from analysis.confusion import measure_rates
-from analysis.congruence import congruence_classes
-from analysis.perline import learn_tables
 from analysis.quadrature import Moments, exact_moments
-from analysis.reading import Measured, Strategies, compare_strategies, lines_in_a_dictionary_of, measured_both_ways
-from analysis.sensor import SensorModel
+from analysis.reading import Measured, measured_both_ways
 from lab.base.errors import RequestError
 from lab.cli.choosing import FontOption
-from lab.cli.output import JsonFlag, emit, progress_bar, say, show_table
+from lab.cli.output import JsonFlag, emit, lines_needed, progress_bar, say, show_table
+from lab.reading import reading_strategies
 from lab.recognisers import sensor_model
-from lab.separability import separability
 from lab.settings import Settings
 from projector.dictionary import load_dictionary, shape_from
 from projector.text import TEXT_PREFIX
-
-_TABLE_LINES = 20_000
-_SIZES = (2, 5, 10, 20, 50, 100, 200, 500, 1000, 10**4, 10**5, 10**6)
 
 
 def show_reading(
@@ -55,7 +47,9 @@ def show_reading(
         letter: exact_moments(known[TEXT_PREFIX + letter].geometry) for letter in dict.fromkeys(word)
     }
     measured = measured_both_ways(whole, [(letter, own[letter]) for letter in word], lines, name=word)
-    strategies = _strategies(word, confidence, model, np.random.default_rng(seed), font, quiet=as_json)
+    rng = np.random.default_rng(seed)
+    with progress_bar("shapes", quiet=as_json) as update:
+        strategies = reading_strategies(word, rng, confidence=confidence, model=model, font=font, progress=update)
     if as_json:
         emit(
             {
@@ -74,7 +68,7 @@ def show_reading(
         f"Lines for {100 * confidence:g} % right",
         ("words to choose from", "as one shape", "letter by letter"),
         [
-            (str(size), _count(as_word), _count(strategies.by_letters))
+            (str(size), lines_needed(as_word), lines_needed(strategies.by_letters))
             for size, as_word in zip(strategies.sizes, strategies.as_word, strict=True)
         ],
     )
@@ -84,44 +78,6 @@ def show_reading(
         say(f"letter by letter takes fewer lines from {strategies.crossover} words on")
 
 
-def _strategies(
-    word: str,
-    confidence: float,
-    model: SensorModel | None,
-    rng: np.random.Generator,
-    font: Path | None,
-    *,
-    quiet: bool,
-) -> Strategies:
-    """Lines for the word both ways: its letters among the letters, and itself among words like the Charter's."""
-    letters, words = load_dictionary("letters", font=font), load_dictionary("words", font=font)
-    words.setdefault(TEXT_PREFIX + word, shape_from(TEXT_PREFIX + word, font=font))
-    outlines = {name: shape.geometry for name, shape in words.items()}
-    twins = {name: members for members in congruence_classes(outlines) for name in members}
-    rivals = np.array([[other not in twins[name] for other in outlines] for name in outlines])
-    done = 0
-
-    def step(_name: str = "") -> None:
-        nonlocal done
-        done += 1
-        update(done, 1 + len(outlines))
-
-    with progress_bar("shapes", quiet=quiet) as update:
-        # the word is only right if all its letters are
-        each = confidence ** (1 / len(word))
-        found = separability(letters, rng, confidence=each, model=model, table_lines=_TABLE_LINES)
-        of_letter = {entry.name.removeprefix(TEXT_PREFIX): entry.line.lines for entry in found.entries}
-        step()
-        tables = learn_tables(outlines, rng, lines=_TABLE_LINES, model=model)
-        confusion = measure_rates(outlines, tables, rivals, rng, lines=_TABLE_LINES, model=model, progress=step)
-    row = list(outlines).index(TEXT_PREFIX + word)
-    return compare_strategies(
-        [of_letter[letter] for letter in word],
-        lambda size: lines_in_a_dictionary_of(confusion, row, size, confidence),
-        _SIZES,
-    )
-
-
 def _row(measured: Measured) -> tuple[str, str, str, str]:
     return (
         measured.name,
@@ -129,7 +85,3 @@ def _row(measured: Measured) -> tuple[str, str, str, str]:
         f"{measured.area_cm2:.1f} ± {measured.sigma_area_cm2:.1f}",
         f"{measured.perimeter_cm:.1f} ± {measured.sigma_perimeter_cm:.1f}",
     )
-
-
-def _count(lines: int | None) -> str:
-    return "never" if lines is None else str(lines)

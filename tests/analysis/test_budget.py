@@ -14,16 +14,16 @@ from analysis.budget import (
     Stage,
     budget_of,
     groups_of,
-    jackknife_sigma,
     predicted_budget,
-    sizes,
 )
 from analysis.edgeshift import RAMP_PER_RADIUS, Outline, Ramps, fit_edge_shift, ramp_of_line
 from analysis.estimate import ratio_bias
+from analysis.invariants import sizes
 from analysis.quadrature import exact_moments
 from analysis.replay import Passes, sensed_sums, true_sums
 from analysis.sensor import SensorModel
 from lab.base.errors import RequestError
+from lab.base.jackknife import jackknife_sigma
 
 L_SHAPE = Polygon([(0, 0), (24, 0), (24, 10), (12, 10), (12, 24), (0, 24)])
 ANNULUS = Point(3, 1).buffer(15, quad_segs=64).difference(Point(3, 1).buffer(7, quad_segs=64))
