@@ -37,8 +37,9 @@ bench: setup
 	$(BIN)/python -m pytest tests/bench -o addopts=--import-mode=importlib -o python_files='bench_*.py' -o timeout=600 \
 		--benchmark-columns=min,median,max,rounds --benchmark-sort=name $(ARGS)
 
-# The documents are Markdown that reads as it is; this proves that their links and commands hold.
+# The site, in build/docs; a warning is an error. Then the links, commands and outputs of the pages.
 docs: setup
+	$(BIN)/sphinx-build -q -W -n --keep-going docs build/docs
 	$(BIN)/python -m pytest -q tests/docs $(ARGS)
 
 clean:

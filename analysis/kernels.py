@@ -17,11 +17,14 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
+CORES = "CHORDLAB_CORES"  # how many of the machine's cores a process may use, where it is one of several
+
+
 def available_cores() -> int:
     """Number of cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    told = os.environ.get(CORES, "")
+    return max(1, min(cores, int(told))) if told.isdecimal() else cores
 
 
 # Every kernel releases the GIL.

@@ -14,11 +14,12 @@ import inspect
 import io
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import fields
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shapely
@@ -31,6 +32,9 @@ from lab.base.errors import RequestError
 from lab.base.files import write_aside
 
 Progress = Callable[[int, int], None]
+Packed = dict[str, NDArray[np.generic]]
+# Has a task done on each of some items, and gives (item, result) in any order.
+Mapper = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[tuple[Any, Any]]]
 
 DEFAULT_LINES = 50_000
 _LIMIT_BYTES = 512 << 20
@@ -121,12 +125,14 @@ def learn_lines(
     seed: int = 0,
     store: TableStore | None = None,
     workers: int | None = None,
+    mapper: Mapper | None = None,
     progress: Progress | None = None,
 ) -> dict[str, SensedLines]:
     """Learn how the lines of each entry look through ``sensor``, or read it from ``store``.
 
     The result is the same to the last bit whether it was learnt or read, whatever the number of ``workers``
-    (threads; default: the cores) and whatever else is in the dictionary. ``progress`` is told, from the caller's own
+    (threads; default: the cores) and whatever else is in the dictionary. ``mapper`` spreads what is to be learnt
+    otherwise, over processes or a cluster; the store is used here alone. ``progress`` is told, from the caller's own
     thread, how many of the entries are there.
 
     Raises:
@@ -135,32 +141,48 @@ def learn_lines(
     """
     if not entries:
         raise RequestError("the dictionary is empty; give at least one entry to learn")
+    found: dict[str, SensedLines] = {}
+    to_learn: list[tuple[str, Geometry]] = []
+    keys: dict[str, str] = {}
 
-    def learn(geometry: Geometry) -> SensedLines:
-        outline = _outline_digest(geometry)
-        key = _key(outline, sensor, lines, seed)
-        sensed = _unpacked(store.load(key)) if store is not None else None
-        if sensed is not None:
-            return sensed
-        stream = np.random.default_rng([seed, *np.frombuffer(bytes.fromhex(outline), dtype=np.uint32).tolist()])
-        packed = _packed(sensor.sense(geometry, lines, stream, threads=1))
+    def keep(name: str, sensed: SensedLines) -> None:
+        found[name] = sensed
+        if progress is not None:
+            progress(len(found), len(entries))
+
+    for name, geometry in entries.items():
+        keys[name] = _key(_outline_digest(geometry), sensor, lines, seed)
+        sensed = _unpacked(store.load(keys[name])) if store is not None else None
+        if sensed is None:
+            to_learn.append((name, geometry))
+        else:
+            keep(name, sensed)
+    learn = partial(learn_entry, sensor=sensor, lines=lines, seed=seed)
+    for (name, _), packed in (mapper or partial(_by_threads, workers=workers))(learn, to_learn):
         if store is not None:
-            store.save(key, packed)
-        return _whole(packed)
-
-    with ThreadPoolExecutor(workers or available_cores(), thread_name_prefix="learn") as pool:
-        futures = {pool.submit(learn, geometry): name for name, geometry in entries.items()}
-        try:
-            for done, future in enumerate(as_completed(futures), start=1):
-                future.result()
-                if progress is not None:
-                    progress(done, len(futures))
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+            store.save(keys[name], packed)
+        keep(name, _whole(packed))
     if store is not None:
         store.tidy()
-    found = {name: future.result() for future, name in futures.items()}
     return {name: found[name] for name in entries}
+
+
+def learn_entry(entry: tuple[str, Geometry], *, sensor: SensorModel, lines: int, seed: int) -> Packed:
+    """Learn one entry (name, geometry): the arrays that are kept of it. The name does not matter."""
+    stream = np.frombuffer(bytes.fromhex(_outline_digest(entry[1])), dtype=np.uint32)
+    return _packed(sensor.sense(entry[1], lines, np.random.default_rng([seed, *stream.tolist()]), threads=1))
+
+
+def _by_threads(
+    learn: Callable[[tuple[str, Geometry]], Packed], entries: Sequence[tuple[str, Geometry]], *, workers: int | None
+) -> Iterator[tuple[tuple[str, Geometry], Packed]]:
+    with ThreadPoolExecutor(workers or available_cores(), thread_name_prefix="learn") as pool:
+        futures = {pool.submit(learn, entry): entry for entry in entries}
+        try:
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _outline_digest(geometry: Geometry) -> str:

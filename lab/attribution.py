@@ -6,7 +6,7 @@ of the LEDs; here they get the robots' names, and every frame the run that its r
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -72,14 +72,18 @@ def camera_estimate(true_lines: pd.DataFrame, crossings: pd.DataFrame, lines: pd
     return stored_estimate(made, known)
 
 
-def lines_from_the_edge(true_lines: pd.DataFrame, lines: pd.DataFrame, region: Polygon) -> pd.DataFrame:
+def lines_from_the_edge(
+    true_lines: pd.DataFrame, lines: pd.DataFrame, region: Polygon, part_of: Mapping[int, int] | None = None
+) -> pd.DataFrame:
     """The true lines of runs that began at the edge, robot by robot, each as long as it would have been.
 
     Where a run ends says nothing of how its robot turned, so one cut short by another robot counts as the line that
-    it lay on; what begins at another robot, or where a robot was set down, does not follow the law of the edge.
+    it lay on; what begins at another robot, or where a robot was set down, does not follow the law of the edge. It is
+    set down anew in each part of a session that was resumed: ``part_of`` is the part of each run (no entry: 0).
     """
     runs = lines.sort_values(["robot", "t_start_s"])
-    before = runs.groupby("robot")["ended"].shift()
+    part = [(part_of or {}).get(line, 0) for line in runs["line"].tolist()]
+    before = runs.assign(part=part).groupby(["robot", "part"])["ended"].shift()
     began = runs.assign(cut=~runs["ended"].isin(EDGES))[before.isin(EDGES).to_numpy()]
     found = began[["line", "cut"]].merge(true_lines, on="line")
     whole_cm = _chord_cm(found["theta_rad"].to_numpy(dtype=float), found["p_cm"].to_numpy(dtype=float), region)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from lab.pictures import Picture, Pictures, check_on_floor, draw_pictures
+from lab.replayed import replayed_bench
 from lab.settings import Settings
 from lab.world import virtual_world
 from projector.device import ProjectorDevice, ProjectorError, open_projector
@@ -18,7 +19,7 @@ from projector.shape import Shape
 from robot.bolt import Bolt
 from robot.device import RobotDevice
 from robot.selfguided import SelfGuided
-from tracking.cameras import Camera, open_camera
+from tracking.cameras import Camera, Frame, open_camera
 from tracking.recorder import Recorder
 
 SETTLE_S = 0.3  # a projector's latency, and a light sample or a frame under way, after the picture changes
@@ -75,8 +76,14 @@ async def keep_alive(projector: ProjectorDevice) -> None:
 
 
 @asynccontextmanager
-async def open_bench(settings: Settings, shape: Shape, seed: np.random.SeedSequence) -> AsyncGenerator[Bench]:
-    """Open the bench for one shape.
+async def open_bench(
+    settings: Settings,
+    shape: Shape,
+    seed: np.random.SeedSequence,
+    *,
+    on_frame: Callable[[Frame], None] | None = None,
+) -> AsyncGenerator[Bench]:
+    """Open the bench for one shape; ``on_frame`` is called with every frame of the camera.
 
     Raises:
         ShapeError: the shape does not fit the arena.
@@ -88,7 +95,10 @@ async def open_bench(settings: Settings, shape: Shape, seed: np.random.SeedSeque
     profile = settings.profile()
     guest: SelfGuided | None = None
     async with AsyncExitStack() as stack:
-        if settings.is_virtual:
+        if settings.replayed is not None:
+            played = replayed_bench(settings.replayed, settings, optics.image_size, SETTLE_S)
+            robots, projector, camera = played.robots, played.projector, played.camera
+        elif settings.is_virtual:
             world = await stack.enter_async_context(virtual_world(settings, seed, profile))
             robots, guest, projector, camera = world.robots, world.guest, world.projector, world.camera
         else:
@@ -109,9 +119,9 @@ async def open_bench(settings: Settings, shape: Shape, seed: np.random.SeedSeque
             stack.push_async_callback(device.disconnect)
         recorder = None
         if camera is not None:
-            recorder = Recorder(camera)
+            recorder = Recorder(camera, on_frame=on_frame)
             await recorder.start()
             stack.push_async_callback(recorder.stop)
             settings.camera_calibration().check_size(camera.size)
-        cruising_cm_s = profile.cm_s_per_unit * profile.speed_units(settings.motion.speed_cm_s)
+        cruising_cm_s = profile.cruising_cm_s(settings.motion.speed_cm_s)
         yield Bench(robots, guest, projector, camera, recorder, pictures, cruising_cm_s)

@@ -21,20 +21,20 @@ from analysis.budget import (
     Stage,
     budget_of,
     groups_of,
-    jackknife_sigma,
     predicted_budget,
-    sizes,
 )
 from analysis.edgeshift import EdgeShift
 from analysis.estimate import ratio_bias
-from analysis.invariants import invariants_table
+from analysis.invariants import invariants_table, sizes
 from analysis.quadrature import Moments
 from analysis.replay import Passes, sensed_sums, true_sums
 from analysis.sensor import SensorModel
+from lab.base.jackknife import jackknife_sigma
+from lab.parts import LearntLevels
 from lab.recognisers import sensor_model
 from lab.settings import Settings
 from lab.tally import stored_cut_lines
-from lab.watched import Edges, Readings, Watched, levels_of, readings_of, watch
+from lab.watched import Edges, Readings, Watched, readings_of, watch
 from projector.shape import Silhouette
 from robot.cutlines import estimate_interrupted
 from robot.interrupted import InterruptedEstimator
@@ -42,7 +42,8 @@ from robot.turning import Policy
 from tracking.anisotropy import TooFewHitsError, bias_from
 
 if TYPE_CHECKING:
-    from lab.review import Filmed, Reviewed
+    from lab.filmed import Filmed
+    from lab.review import Reviewed
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -93,15 +94,15 @@ class _Rolled:
         path_cm = math.inf
         if counted["robot"].nunique() > 1:
             path_cm = estimate_interrupted(stored_cut_lines(counted, crossings)).path_per_cut_cm
-        levels = levels_of(found.session.manifest)
+        levels = LearntLevels.of(found.session)
         model = sensor_model(found.settings)
-        first = next(iter(levels.values()), None)
+        first = next(iter(levels.by_part[0].values()), None)
         if first is not None:
             span_lux = first["bright_lux"] - first["dark_lux"]
             model = replace(model, margin=(first["high_lux"] - first["mid_lux"]) / span_lux)
 
         def readings(line: int, robot: str) -> Readings:
-            return readings_of(found.session, line, levels.get(robot, levels.get("")))
+            return readings_of(found.session, line, levels.get(line, robot))
 
         weight = np.asarray(counted["weight"] / counted["weight"].mean(), dtype=float)
         return cls(found.shape.geometry, counted, crossings, weight, path_cm, model, readings, found.settings)

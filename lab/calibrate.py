@@ -19,9 +19,11 @@ import pandas as pd
 from lab.base.errors import RequestError
 from lab.bench import Bench, open_bench
 from lab.clock import run as run_on_clock
-from lab.review import on_host_clock, stored_settings
+from lab.filmed import on_host_clock
 from lab.settings import Settings
-from lab.store import LIGHT, SessionReader, line_folder
+from lab.store.layout import LIGHT
+from lab.store.reader import SessionReader, numbers_of
+from lab.stored import stored_settings
 from projector.dictionary import shape_from
 from robot.bolt import Bolt
 from robot.characterise import Finding, Roll, Say, Show, Trial, neutral, roll_runs
@@ -351,8 +353,8 @@ def scales_of_session(folder: Path, *, workers: int, progress: Progress | None =
     units = round(cruising_cm_s / profile.cm_s_per_unit)
     wheels: dict[int, Wheels] = {}
     for line in segments:
-        light = pd.read_parquet(line_folder(folder, line) / LIGHT)
-        raw = light[["t_host_s", "x_cm", "y_cm", "speed_cm_s"]].to_numpy(dtype=float)
+        light = numbers_of(session.line_path(line, LIGHT), ("t_host_s", "x_cm", "y_cm", "speed_cm_s"))
+        raw = light.to_numpy()
         # What the driver made of the odometer is undone: the robot's own figures count.
         path, speed = path_of(raw[:, 1], raw[:, 2]) / profile.locator_scale, raw[:, 3] / profile.locator_scale
         wheels[line] = Wheels(float(units), raw[:, 0], path, speed)

@@ -23,8 +23,8 @@ from analysis.classes import (
 )
 from analysis.figures.classes import ClassPoint
 from lab.base.errors import ChordlabError, RequestError
-from lab.finalize import tables_of
-from lab.store import SessionReader
+from lab.store.reader import SessionReader
+from lab.store.tables import tables_of
 
 _NEAREST = 2
 

@@ -50,6 +50,21 @@ class Ledger:
     recogniser: Recogniser
     n: int = 0
 
+    def enter(self, record: dict[str, Any], n: int, estimates: Estimates) -> None:
+        """Take a run's record, whose run is in the sums already; of a crossing line, add the ``estimate`` after it.
+
+        Args:
+            record: as in the log; a line that is not whole would look like another shape's, and is not recognised by.
+            n: counted lines that crossed the shape, this one among them.
+            estimates: what the sums give.
+        """
+        if not (record["counts"] and record["k"]):
+            return
+        self.n = n
+        if record["whole"]:
+            self.recogniser.update(record["k"], record["l1_cm"], record["l3_cm3"], record["weight"])
+        record["estimate"] = self.estimate(estimates)
+
     def estimate(self, estimates: Estimates) -> dict[str, Any]:
         """The log's record of the estimates after ``n`` lines; None for what is not known."""
         leading, posterior = self.recogniser.ranked()[0]

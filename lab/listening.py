@@ -11,18 +11,17 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from analysis.recognition import Recogniser
 from lab.base.errors import ChordlabError
 from lab.bench import SETTLE_S, Bench
 from lab.ledger import Ledger, Watcher
+from lab.live.live import Live
 from lab.pictures import Picture
 from lab.rigcheck import check_bench
-from lab.roller import SessionError, SessionLevels
-from lab.session import LEVEL_SAMPLES, Outcome, Preflight
+from lab.roller import SessionError
+from lab.session import LEVEL_SAMPLES, Outcome, PlainLight, Preflight
 from lab.settings import Settings
-from lab.store import SessionWriter
+from lab.store.writer import SessionWriter
 from robot.backoff import persist
-from robot.crossings import learn_levels
 from robot.device import Sample
 from robot.errors import RobotError
 from robot.onboard import Estimator
@@ -60,10 +59,11 @@ class Listening:
         bench: the devices.
         guest: the robot.
         settings: the session's.
-        recogniser: fed with each line.
+        ledger: what it knows so far.
         seed: of the robot's turns.
         watch: told where the session stands, after each line.
         say: told in words what befalls the robot.
+        live: what people ask of it meanwhile, and are shown. A robot that rolls alone cannot be paused.
     """
 
     def __init__(
@@ -71,11 +71,12 @@ class Listening:
         bench: Bench,
         guest: SelfGuided,
         settings: Settings,
-        recogniser: Recogniser,
+        ledger: Ledger,
         seed: np.random.SeedSequence,
         *,
         watch: Watcher | None = None,
         say: Callable[[str], None] = lambda _: None,
+        live: Live | None = None,
     ) -> None:
         self._bench = bench
         self._guest = guest
@@ -83,7 +84,9 @@ class Listening:
         self._seed = seed
         self._watch = watch
         self._say = say
-        self._ledger = Ledger(settings.stop, recogniser)
+        self._ledger = ledger
+        self._controls = (live or Live()).controls
+        self._state, self._runs = "failed", 0
         self._own = _Own(Estimator())
         self._battery_v = math.nan
         self._heard: asyncio.Queue[OnboardLine | str] = asyncio.Queue()
@@ -100,11 +103,12 @@ class Listening:
         await guest.connect()
         identity = await guest.identity()
         self._battery_v = identity.battery_v
-        levels = learn_levels(await self._light_of(pictures.floor), await self._light_of(pictures.lit))
+        light = PlainLight(await self._light_of(pictures.floor), await self._light_of(pictures.lit), None)
+        levels = light.levels()
         await check_bench(self._bench, self._settings)
         self._bench.show(pictures.shape)
         await asyncio.sleep(SETTLE_S)
-        return Preflight((identity,), (SessionLevels(levels),))
+        return Preflight((identity,), (levels,), (light,))
 
     async def roll(self, writer: SessionWriter, preflight: Preflight) -> Outcome:
         """Listen until the session's end. On every way out the robot is told to stop, and the log says how it ended.
@@ -114,30 +118,36 @@ class Listening:
         """
         loop = asyncio.get_running_loop()
         t_start_s = loop.time()
-        levels = preflight.levels[0]
-        if levels is None:
-            raise SessionError(f"{self._guest.name}: its light levels are not known; run the preflight first")
-        writer.append("start", t_s=t_start_s, levels=[asdict(levels)])
-        state, runs = "failed", 0
+        writer.append("start", **preflight.began(t_start_s, 0))
+
+        def log(kind: str, **data: object) -> None:
+            writer.append(kind, t_s=loop.time(), **data)
+
         try:
             seed = int(self._seed.generate_state(1, np.uint32)[0])
-            await self._guest.start(self._settings.motion.speed_cm_s, seed, levels.shape)
-            while state == "failed":
-                await self._film(writer, runs)
-                line = await self._next(writer)
-                await self._keep(writer, line, runs)
-                self._bench.check_light()
-                runs += 1
-                state = self._ledger.reason_to_stop() or state
+            await self._guest.start(self._settings.motion.speed_cm_s, seed, preflight.levels[0].shape)
+            with self._controls.attending(1, log):
+                if not await self._controls.unless_stopped(self._until_done(writer)) and self._state == "failed":
+                    self._state = "stopped"
         except asyncio.CancelledError:
-            state = "interrupted"
+            self._state = "interrupted"
             raise
         finally:
             await asyncio.shield(self._let_rest())
-            outcome = Outcome(state, runs, self._ledger.n, loop.time() - t_start_s)
+            outcome = Outcome(self._state, self._runs, self._ledger.n, loop.time() - t_start_s)
             writer.append("end", t_s=loop.time(), lost_lines=self._guest.lost_lines, **asdict(outcome))
             writer.finish(asdict(outcome))
         return outcome
+
+    async def _until_done(self, writer: SessionWriter) -> None:
+        """Take line after line until the session has enough."""
+        while self._state == "failed":
+            await self._film(writer, self._runs)
+            line = await self._next(writer)
+            await self._keep(writer, line, self._runs)
+            self._bench.check_light()
+            self._runs += 1
+            self._state = self._ledger.reason_to_stop() or self._state
 
     async def _next(self, writer: SessionWriter) -> OnboardLine:
         """The next line; a lost robot is called back meanwhile, and rolls on whether it is heard or not."""
@@ -202,10 +212,7 @@ class Listening:
         }
         self._own.area_cm2, self._own.perimeter_cm = told.area_cm2, told.perimeter_cm
         self._own.sums.add_line(told.k, told.l1_cm, told.l3_cm3)
-        if told.k:
-            self._ledger.n = self._own.sums.lines
-            self._ledger.recogniser.update(told.k, told.l1_cm, told.l3_cm3)
-            record["estimate"] = self._ledger.estimate(self._own)
+        self._ledger.enter(record, self._own.sums.lines, self._own)
         writer.append("line", **record)
         if self._watch is not None:
             self._watch(self._ledger.progress(self._own, line, told.t_host_s, self._battery_v))

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
+Lux = Annotated[float, Field(ge=0, le=1e6)]  # ten times sunlight
+_LEAST_SPAN_LUX = 1e-3
 
 
 class Section(BaseModel):
-    """A table of the settings' file: unknown keys are refused, and nothing changes once it is read."""
+    """A table of the settings' file: unknown keys and infinite numbers are refused, nothing changes once it is read."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
 
 
 class FaultSettings(Section):
@@ -48,14 +50,14 @@ class VirtualSettings(Section):
     """Curvature of a run, one standard deviation."""
     footprint_cm: Annotated[float, Field(ge=0, le=5)] = 0.3
     """Radius of the floor patch that the light sensor averages over."""
-    light_noise_lux: Annotated[float, Field(ge=0)] = 1.0
+    light_noise_lux: Lux = 1.0
     """Noise of one light sample, one standard deviation."""
-    ambient_lux: Annotated[float, Field(ge=0)] = 15.0
+    ambient_lux: Lux = 15.0
     """Room light."""
-    black_lux: Annotated[float, Field(ge=0)] = 5.0
+    black_lux: Lux = 5.0
     """What the projector throws where its picture is black."""
-    white_lux: Positive = 105.0
-    """What the projector throws where its picture is white."""
+    white_lux: Lux = 105.0
+    """What the projector throws where its picture is white; more than where it is black."""
     blur_px: Annotated[float, Field(ge=0, le=50)] = 1.0
     """Defocus of the projector, one standard deviation in its own pixels."""
     camera_noise: Annotated[float, Field(ge=0, le=50)] = 2.0
@@ -72,3 +74,9 @@ class VirtualSettings(Section):
     """Share of the notifications that are lost."""
     faults: tuple[FaultSettings, ...] = ()
     """Mishaps to come, to see how a session bears them."""
+
+    @model_validator(mode="after")
+    def _white_is_brighter(self) -> Self:
+        if self.white_lux - self.black_lux < _LEAST_SPAN_LUX:
+            raise ValueError(f"white_lux must lie {_LEAST_SPAN_LUX:g} lux or more above black_lux")
+        return self

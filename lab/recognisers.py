@@ -14,7 +14,7 @@ from analysis.congruence import congruence_classes
 from analysis.perline import LineRecogniser, LineTables, tables_of
 from analysis.recognition import Recogniser
 from analysis.sensor import SensorModel
-from analysis.tablestore import TableStore, learn_lines
+from analysis.tablestore import Mapper, TableStore, learn_lines
 from lab.pictures import span_of
 from lab.settings import Settings, VirtualSettings
 from projector.shape import Shape
@@ -86,8 +86,7 @@ def sensor_model(settings: Settings) -> SensorModel:
     """The light sensor of the robot of these settings; a real one is taken for what a virtual one is by default."""
     world = settings.virtual if settings.is_virtual else VirtualSettings()
     profile, optics = settings.profile(), settings.projector_optics.pinhole()
-    # as the driver will: the speed's command comes in whole units
-    cruising_cm_s = profile.speed_units(settings.motion.speed_cm_s) * profile.cm_s_per_unit
+    cruising_cm_s = profile.cruising_cm_s(settings.motion.speed_cm_s)
     throw_cm = float(optics.centre_cm[2]) - settings.sensor.height_cm
     blur_cm = world.blur_px * throw_cm / float(optics.camera_matrix[0, 0])
     span_lux = span_of(settings.arena) * (world.white_lux - world.black_lux)
@@ -127,9 +126,10 @@ def tables_for(
     called: str | None = None,
     progress: Callable[[int, int], None] | None = None,
     store: TableStore | None = None,
+    mapper: Mapper | None = None,
 ) -> LineTables:
-    """The tables of the recogniser; arguments as for `recogniser_for`."""
+    """The tables of the recogniser; arguments as for `recogniser_for`, ``mapper`` as for `learn_lines`."""
     outlines = {name: shape.geometry for name, shape in dictionary.items()}
-    seen = learn_lines(outlines, sensor_model(settings), store=store or TableStore(), progress=progress)
+    seen = learn_lines(outlines, sensor_model(settings), store=store or TableStore(), mapper=mapper, progress=progress)
     classes = [sorted(members, key=lambda name: name != called) for members in congruence_classes(outlines)]
     return tables_of({name: lines.invariants() for name, lines in seen.items()}, classes)

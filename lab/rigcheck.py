@@ -184,7 +184,7 @@ async def check_bench(bench: Bench, settings: Settings) -> RigCheck | None:
         RigError: it does not, or the markers cannot be seen.
     """
     recorder = bench.recorder
-    if recorder is None or settings.camera.startswith("file:") or settings.rig_limit_mm == 0:
+    if recorder is None or settings.camera.startswith(("file:", "replay:")) or settings.rig_limit_mm == 0:
         return None
     camera, projector = settings.camera_optics.pinhole(), settings.projector_optics.pinhole()
     bench.show(rig_picture(settings.arena, camera, projector))

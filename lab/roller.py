@@ -18,7 +18,7 @@ from lab.run import Run
 from lab.settings import Settings
 from robot.crossings import CrossingDetector, Levels
 from robot.device import Bump, Identity, RobotDevice, Sample
-from robot.edge import EdgeError, EdgeLevels, EdgePoint, FeltEdge, RingedDetector, feel_edge
+from robot.edge import EdgeError, EdgeLevels, EdgePoint, FeltEdge, KnowsEdge, RingedDetector, feel_edge
 from robot.errors import LinkLostError, NotConnectedError, ReplyTimeoutError
 from robot.turning import Leg, Navigator, Policy, navigator_for
 
@@ -53,6 +53,14 @@ class SessionLevels:
     edge: EdgeLevels | None = None
 
 
+class Onlooker(Protocol):
+    """Who looks on while robots roll."""
+
+    def __call__(self, robot: str, sample: Sample, *, lit: bool, line: int | None, battery_v: float) -> None:
+        """A robot's sample; whether its LED is to be lit, and the run that it is on. Must return quickly."""
+        ...
+
+
 class Roller:
     """One robot on the floor.
 
@@ -77,6 +85,7 @@ class Roller:
         self.robot = robot
         self.battery_v = math.nan
         self.bumped_s = -math.inf
+        self.onlooker: Onlooker | None = None
         self._settings = settings
         self._cruising_cm_s = cruising_cm_s
         self._led_rgb = led_rgb
@@ -97,6 +106,11 @@ class Roller:
     def name(self) -> str:
         """The robot's name."""
         return self.robot.name
+
+    @property
+    def used_up(self) -> bool:
+        """Whether it is a stored robot whose runs are all played."""
+        return bool(getattr(self.robot, "used_up", False))
 
     async def connect(self) -> Identity:
         """Find the robot and start its stream of light.
@@ -178,8 +192,12 @@ class Roller:
             self._run = None
         return run
 
-    async def next_leg(self, run: Run) -> Leg:
+    async def next_leg(self, run: Run, *, moved: bool = False) -> Leg:
         """What to do after ``run``: call the robot back, let it charge, turn.
+
+        Args:
+            run: the last one.
+            moved: whether it may have been carried since: it then sets out anew.
 
         Raises:
             ReconnectError: its link broke and it did not come back.
@@ -188,7 +206,7 @@ class Roller:
         if self._lost:  # after a bump too, while it was told to stop: that line is whole
             await self._call_back()
             return self._navigator.first()
-        if await self._rested():
+        if await self._rested() or moved:
             return self._navigator.first()
         return self._navigator.next(run.as_leg_end())
 
@@ -234,6 +252,11 @@ class Roller:
     async def _feel_edge(self, run: Run, levels: EdgeLevels, entered: EdgePoint) -> None:
         """Find the heading from the ring straight into the arena, where the policy turns by it."""
         if self._settings.motion.turning == Policy.INTERIOR:
+            return
+        if isinstance(self.robot, KnowsEdge):
+            self._felt = await self.robot.felt_edge()
+            if self._felt is not None:
+                run.normal_heading_rad = self._felt.normal_heading_rad
             return
         arena = self._settings.arena
         radius_cm = arena.radius_cm - arena.ring_cm if arena.kind == "disc" else math.inf
@@ -353,6 +376,7 @@ class Roller:
         for listener in tuple(self._listeners):
             listener(sample)
         run = self._run
+        self._show(sample, run)
         if run is None:
             return
         if run.ended:
@@ -369,6 +393,11 @@ class Roller:
             self._finish(run, "stop")
         elif run.stalled:
             self._finish(run, "stall")
+
+    def _show(self, sample: Sample, run: Run | None) -> None:
+        if self.onlooker is not None:
+            lit, line = (False, None) if run is None else (run.detector.lit, run.line)
+            self.onlooker(self.name, sample, lit=lit, line=line, battery_v=self.battery_v)
 
     def _on_bump(self, bump: Bump) -> None:
         self.bumped_s = bump.t_host_s

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import pandas as pd
 
@@ -155,6 +156,27 @@ class Run:
     def as_leg_end(self) -> LegEnd:
         """What whoever chooses the next leg must know of it."""
         return LegEnd(self.leg, self.length_cm, self.normal_heading_rad, self.at_edge)
+
+    def record(self) -> dict[str, Any]:
+        """What the log keeps of it, but for what it adds to the sums."""
+        took_s = self.t_end_s - self.t_start_s
+        return {
+            "line": self.line,
+            "robot": self.robot,
+            "t_start_s": self.t_start_s,
+            "t_rolling_s": self.t_rolling_s,
+            "t_end_s": self.t_end_s,
+            "length_cm": self.length_cm,
+            "end_cm": self.path_cm(self.t_end_s),
+            "speed_cm_s": self.rolled_cm / took_s if took_s > 0 else 0.0,
+            "heading_rad": self.leg.heading_rad,
+            "normal_heading_rad": self.normal_heading_rad,
+            "ended": self.ended,
+            "starts_lit": self.starts_lit,
+            "ends_lit": self.ends_lit,
+            "whole": self.is_line,
+            "crossings": [[crossing.t_s, crossing.s_cm, crossing.entering] for crossing in self.crossings],
+        }
 
     def light(self) -> pd.DataFrame:
         """The raw samples: t_host_s, light_lux, x_cm, y_cm, speed_cm_s."""

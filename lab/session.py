@@ -13,18 +13,18 @@ from typing import Any
 
 import numpy as np
 
-from analysis.recognition import Recogniser
 from lab.base.colours import led_rgb
 from lab.base.errors import ChordlabError
 from lab.bench import SETTLE_S, Bench
 from lab.ledger import Ledger, Watcher
+from lab.live.live import Live
 from lab.pictures import Picture
 from lab.rigcheck import check_bench
 from lab.roller import Roller, SessionError, SessionLevels
 from lab.run import Run
 from lab.settings import Settings
-from lab.store import SessionWriter
-from lab.tally import tally_for
+from lab.store.writer import SessionWriter
+from lab.tally import Tally
 from robot.crossings import learn_levels
 from robot.device import Identity
 from robot.edge import learn_edge_levels
@@ -39,11 +39,59 @@ CONTACT_WINDOW_S = 0.05  # two reports of one contact, each with its latency; wi
 
 
 @dataclass(frozen=True, slots=True)
+class PlainLight:
+    """What one robot read under plain fields of light, in lux: what its levels were learnt from."""
+
+    floor: Sequence[float]
+    lit: Sequence[float]
+    ring: Sequence[float] | None
+
+    def levels(self) -> SessionLevels:
+        """The light levels. Raises LevelsError when they do not separate."""
+        edge = None if self.ring is None else learn_edge_levels(self.floor, self.lit, self.ring)
+        return SessionLevels(learn_levels(self.floor, self.lit), edge)
+
+
+@dataclass(frozen=True, slots=True)
 class Preflight:
-    """What the devices said before the first run; a robot that estimates by itself keeps its levels to itself."""
+    """What the devices said before the first run, robot by robot."""
 
     identities: tuple[Identity, ...]
-    levels: tuple[SessionLevels | None, ...]
+    levels: tuple[SessionLevels, ...]
+    light: tuple[PlainLight, ...]
+
+    def began(self, t_s: float, part: int) -> dict[str, Any]:
+        """What the log's ``start`` event holds of it."""
+        told = {
+            "t_s": t_s,
+            "levels": [asdict(levels) for levels in self.levels],
+            "light": [asdict(light) for light in self.light],
+        }
+        return told | {"resumed": True, "part": part} if part else told
+
+
+@dataclass(frozen=True, slots=True)
+class Earlier:
+    """What a session that is resumed has behind it.
+
+    Attributes:
+        part: the number of the part to come.
+        runs: how many there were.
+        next_line: a number above that of every run that ever began.
+        next_film: the same of the film of several robots.
+        rolling_s: how long its parts lasted.
+        t_s: the last time that they tell.
+    """
+
+    part: int = 0
+    runs: int = 0
+    next_line: int = 0
+    next_film: int = 0
+    rolling_s: float = 0.0
+    t_s: float = 0.0
+
+
+NOTHING_EARLIER = Earlier()
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,35 +110,47 @@ class Session:
     Args:
         bench: the devices.
         settings: the session's.
-        recogniser: fed with each line.
+        ledger: what it knows so far.
+        tally: the sums, the same lines in them.
         rngs: one source of turns for each robot.
         watch: told where the session stands, after each run.
         say: told in words what befalls the robots.
+        earlier: what it goes on from.
+        live: what people ask of it meanwhile, and are shown.
     """
 
     def __init__(
         self,
         bench: Bench,
         settings: Settings,
-        recogniser: Recogniser,
+        ledger: Ledger,
+        tally: Tally,
         rngs: Sequence[np.random.Generator],
         *,
         watch: Watcher | None = None,
         say: Callable[[str], None] = lambda _: None,
+        earlier: Earlier = NOTHING_EARLIER,
+        live: Live | None = None,
     ) -> None:
         self._bench = bench
         self._settings = settings
-        self._ledger = Ledger(settings.stop, recogniser)
+        self._ledger = ledger
+        self._tally = tally
         self._watch = watch
         self._say = say
-        self._tally = tally_for(settings)
+        self._earlier = earlier
+        live = live or Live()
+        self._controls = live.controls
         self._rollers = [
             Roller(robot, settings, bench.cruising_cm_s, rng, led_rgb(settings.led_colour(number)), self._noted)
             for number, (robot, rng) in enumerate(zip(bench.robots, rngs, strict=True))
         ]
+        if live.feed.watched:
+            for roller in self._rollers:
+                roller.onlooker = live.feed.sample
         self._writer: SessionWriter | None = None
         self._runs = 0
-        self._film_part = 0
+        self._film_part = earlier.next_film
         self._committing_run = asyncio.Lock()
         self._state = "failed"
 
@@ -107,16 +167,14 @@ class Session:
         floor = await self._light_of(pictures.floor)
         lit = await self._light_of(pictures.lit)
         ring = None if pictures.ring is None else await self._light_of(pictures.ring)
-        levels = tuple(
-            SessionLevels(
-                learn_levels(floor[i], lit[i]), None if ring is None else learn_edge_levels(floor[i], lit[i], ring[i])
-            )
-            for i in range(len(self._rollers))
+        light = tuple(
+            PlainLight(floor[i], lit[i], None if ring is None else ring[i]) for i in range(len(self._rollers))
         )
+        levels = tuple(own.levels() for own in light)
         await check_bench(self._bench, self._settings)
         self._bench.show(pictures.shape)
         await asyncio.sleep(SETTLE_S)
-        return Preflight(identities, levels)
+        return Preflight(identities, levels, light)
 
     async def roll(self, writer: SessionWriter, preflight: Preflight) -> Outcome:
         """Roll until the session's end, each run committed to ``writer`` before the next begins.
@@ -129,17 +187,18 @@ class Session:
         loop = asyncio.get_running_loop()
         t_start_s = loop.time()
         self._writer = writer
-        writer.append("start", t_s=t_start_s, levels=[levels and asdict(levels) for levels in preflight.levels])
+        writer.append("start", **preflight.began(t_start_s, self._earlier.part))
         if self._bench.recorder is not None and self._films_all:
             await self._bench.recorder.open_segment(writer.film_path(self._film_part))
         leds = [asyncio.create_task(roller.follow_with_led()) for roller in self._rollers]
         rolling = [
             asyncio.create_task(self._keep_rolling(roller, levels), name=roller.name)
             for roller, levels in zip(self._rollers, preflight.levels, strict=True)
-            if levels is not None
         ]
         try:
-            await self._until_done(rolling)
+            with self._controls.attending(len(rolling), self._logged):
+                if not await self._controls.unless_stopped(self._until_done(rolling)) and self._state == "failed":
+                    self._state = "stopped"
         except asyncio.CancelledError:
             self._state = "interrupted"
             raise
@@ -148,7 +207,9 @@ class Session:
                 task.cancel()
             # Shielded, so that a second Ctrl-C cannot leave a robot rolling.
             await asyncio.shield(self._come_to_rest(rolling))
-            outcome = Outcome(self._state, self._runs, self._ledger.n, loop.time() - t_start_s)
+            earlier = self._earlier
+            rolling_s = earlier.rolling_s + loop.time() - t_start_s
+            outcome = Outcome(self._state, earlier.runs + self._runs, self._ledger.n, rolling_s)
             writer.append("end", t_s=loop.time(), **asdict(outcome))
             writer.finish(asdict(outcome))
         return outcome
@@ -157,6 +218,9 @@ class Session:
         """Wait until enough is rolled. A robot that is lost for good leaves the rest to the others, if any."""
         left = set(rolling)
         while self._state == "failed":
+            if not left:  # no robot has runs left: a replay has come to its end
+                self._state = "replayed"
+                return
             done, left = await asyncio.wait(left, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
                 error = task.exception()
@@ -167,14 +231,20 @@ class Session:
 
     async def _keep_rolling(self, roller: Roller, levels: SessionLevels) -> None:
         """Roll one robot's legs until the session has enough."""
-        leg = roller.begin(levels)
-        while self._state == "failed":
-            line, self._runs = self._runs, self._runs + 1
+        try:
+            await self._roll_legs(roller, roller.begin(levels))
+        finally:
+            self._controls.left()
+
+    async def _roll_legs(self, roller: Roller, leg: Leg) -> None:
+        while self._state == "failed" and not roller.used_up:
+            line, self._runs = self._earlier.next_line + self._runs, self._runs + 1
             run = await self._one_run(roller, leg, line)
             self._bench.check_light()
             self._state = self._ledger.reason_to_stop() or self._state
-            if self._state == "failed":
-                leg = await roller.next_leg(run)
+            if self._state == "failed" and not roller.used_up:
+                paused = await self._controls.between_runs()
+                leg = await roller.next_leg(run, moved=paused)
 
     async def _one_run(self, roller: Roller, leg: Leg, line: int) -> Run:
         """Roll one leg, filmed where there is a camera, and commit it."""
@@ -221,36 +291,16 @@ class Session:
 
     def _conclude(self, writer: SessionWriter, run: Run, video: dict[str, int] | None) -> None:
         """Estimate from a finished run and put it into the log."""
-        line = self._tally.add(run)
-        record: dict[str, Any] = {
-            "line": run.line,
-            "robot": run.robot,
-            "t_start_s": run.t_start_s,
-            "t_rolling_s": run.t_rolling_s,
-            "t_end_s": run.t_end_s,
-            "length_cm": run.length_cm,
-            "end_cm": run.path_cm(run.t_end_s),
-            "speed_cm_s": run.rolled_cm / (run.t_end_s - run.t_start_s) if run.t_end_s > run.t_start_s else 0.0,
-            "heading_rad": run.leg.heading_rad,
-            "normal_heading_rad": run.normal_heading_rad,
-            "ended": run.ended,
-            "starts_lit": run.starts_lit,
-            "ends_lit": run.ends_lit,
-            "whole": run.is_line,
-            **asdict(line),
-            "video": video,
-            "crossings": [[crossing.t_s, crossing.s_cm, crossing.entering] for crossing in run.crossings],
-        }
-        if line.counts and line.k:
-            self._ledger.n = self._tally.n
-            if run.is_line:  # a line cut short would look like another shape's
-                self._ledger.recogniser.update(line.k, line.l1_cm, line.l3_cm3, line.weight)
-            record["estimate"] = self._ledger.estimate(self._tally.estimates)
+        record = {**run.record(), **asdict(self._tally.add(run)), "video": video}
+        self._ledger.enter(record, self._tally.n, self._tally.estimates)
         writer.append("line", **record)
 
     def _noted(self, kind: str, text: str, **data: object) -> None:
         """Put what befell a robot into the log, and say it."""
         self._say(text)
+        self._logged(kind, **data)
+
+    def _logged(self, kind: str, **data: object) -> None:
         self._committing.append(kind, t_s=asyncio.get_running_loop().time(), **data)
 
     async def _light_of(self, picture: Picture) -> list[list[float]]:

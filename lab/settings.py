@@ -6,18 +6,19 @@ of it, so that a session says how it was made.
 
 from __future__ import annotations
 
+import copy
 import math
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, cast
 
 import numpy as np
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, PrivateAttr, ValidationError, field_validator, model_validator
 from shapely import Point, Polygon, box
 
 from lab.base.colours import LED_COLOURS
 from lab.base.errors import RequestError
+from lab.base.given import one_line, read_given, toml_of
 from lab.base.pinhole import Pinhole
 from lab.physics import Fraction, Positive, Section, VirtualSettings
 from robot.profile import RobotProfile, load_profile
@@ -26,7 +27,9 @@ from tracking.calibration import Calibration, load_calibration
 
 BALL_RADIUS_CM = 3.65  # a Sphero BOLT is 73 mm across
 _VIRTUAL_ROBOTS = ("virtual", "onboard:virtual")
+_REPLAY = "replay:"
 _MOST_ROBOTS = 8
+Extent = Annotated[float, Field(gt=0, le=10_000)]  # of a floor: a hundred metres
 
 
 class ArenaSettings(Section):
@@ -34,11 +37,11 @@ class ArenaSettings(Section):
 
     kind: Literal["rectangle", "disc"] = "rectangle"
     """`rectangle` (width_cm by height_cm) or `disc` (radius_cm)."""
-    width_cm: Positive = 120.0
+    width_cm: Extent = 120.0
     """Inner width between the walls, of a rectangle."""
-    height_cm: Positive = 90.0
+    height_cm: Extent = 90.0
     """Inner height between the walls, of a rectangle."""
-    radius_cm: Positive = 60.0
+    radius_cm: Extent = 60.0
     """Inner radius of the wall, of a disc."""
     edge: Literal["bump", "dark_ring", "bright_ring"] = "bump"
     """What ends a run: a `bump` into the wall, or a ring of light along it: a `dark_ring` (around a dim floor) or a
@@ -166,9 +169,18 @@ class OpticsSettings(Section):
     """Tilt away from the plumb line about the arena's x and y axes."""
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     """Lens distortion k1, k2, p1, p2, k3 (OpenCV's order)."""
+    _held: Pinhole | None = PrivateAttr(default=None)
+
+    def holding(self, optics: Pinhole) -> OpticsSettings:
+        """The same by these optics, in the place of a file that is not to be read again."""
+        held = self.model_copy(update={"calibration": None})
+        held._held = optics
+        return held
 
     def pinhole(self) -> Pinhole:
         """The optics. Raises RequestError for a calibration file that cannot be read."""
+        if self._held is not None:
+            return self._held
         if self.calibration is not None:
             return load_calibration(self.calibration).optics
         tilt_x, tilt_y = self.tilt_deg
@@ -212,13 +224,13 @@ class Settings(Section):
     """Everything random follows from it."""
     robot: str | tuple[str, ...] = "virtual"
     """`ble:SB-1234`, `virtual`, or a list of them; `onboard:CL-1234` listens to a robot that estimates by itself
-    (`onboard:virtual` on the virtual bench)."""
+    (`onboard:virtual` on the virtual bench); `replay:DIR` plays a stored session back, once for each of its robots."""
     robot_profile: Path | None = None
     """A robot-profile.toml, as `chordlab robot characterise` writes it; none: the facts known of every BOLT."""
     camera: str = "virtual"
-    """`usb:0`, `file:video.mkv`, `virtual`, or `none`."""
+    """`usb:0`, `file:video.mkv`, `virtual`, `replay:DIR`, or `none`."""
     projector: str = "virtual"
-    """`display:1`, `image:DIR`, or `virtual`."""
+    """`display:1`, `image:DIR`, `virtual`, or `replay:DIR`."""
     out: Path = Path("sessions")
     """Where session folders go."""
     font: Path | None = None
@@ -237,25 +249,31 @@ class Settings(Section):
     """A filmed session begins with markers on the floor; camera or projector off by more than this is refused. 0: no
     such check."""
     virtual: VirtualSettings = VirtualSettings()
+    _held_profile: RobotProfile | None = PrivateAttr(default=None)
 
     @model_validator(mode="after")
     def _devices_are_known(self) -> Self:
         if not 1 <= len(self.robots) <= _MOST_ROBOTS:
             raise ValueError(f"robot: list 1 to {_MOST_ROBOTS} robots, not {len(self.robots)}")
         for robot in self.robots:
-            _device("robot", robot, {"virtual": False, "ble": True, "onboard": True})
-        _device("camera", self.camera, {"virtual": False, "none": False, "usb": True, "file": True})
-        _device("projector", self.projector, {"virtual": False, "display": True, "image": True})
+            _device("robot", robot, {"virtual": False, "ble": True, "onboard": True, "replay": True})
+        _device("camera", self.camera, {"virtual": False, "none": False, "usb": True, "file": True, "replay": True})
+        _device("projector", self.projector, {"virtual": False, "display": True, "image": True, "replay": True})
+        stored = {device for device in (*self.robots, self.projector, self.camera) if device.startswith(_REPLAY)}
+        if stored and (len(stored) > 1 or {*self.robots, self.projector, self.camera} - {"none"} != stored):
+            raise ValueError(
+                "a stored session is replayed as a whole: set robot, projector and camera (or none) to one replay:DIR"
+            )
         worlds = {robot in _VIRTUAL_ROBOTS for robot in self.robots}
         if worlds != {self.projector == "virtual"}:
             raise ValueError("a virtual robot sees only the virtual projector: make all virtual, or none")
-        if self.camera == "virtual" and not self.is_virtual:
+        if self.camera == "virtual" and self.robots[0] not in _VIRTUAL_ROBOTS:
             raise ValueError("a virtual camera sees only the virtual robot: set camera to usb:N, file:PATH or none")
         return self
 
     @model_validator(mode="after")
     def _robots_get_along(self) -> Self:
-        real = [robot for robot in self.robots if robot not in _VIRTUAL_ROBOTS]
+        real = [robot for robot in self.robots if robot not in _VIRTUAL_ROBOTS and not robot.startswith(_REPLAY)]
         if len(set(real)) < len(real):
             raise ValueError("robot: one robot is listed twice; name each once")
         if self.robots[0].startswith("onboard:") and (
@@ -291,23 +309,38 @@ class Settings(Section):
 
     @property
     def is_virtual(self) -> bool:
-        """Whether the session runs on the virtual bench, at virtual time."""
-        return self.robots[0] in _VIRTUAL_ROBOTS
+        """Whether the session runs on the virtual bench, or is a replay: at virtual time."""
+        return self.robots[0] in _VIRTUAL_ROBOTS or self.replayed is not None
+
+    @property
+    def replayed(self) -> Path | None:
+        """The stored session that is played back, if one is."""
+        return Path(self.robots[0].removeprefix(_REPLAY)) if self.robots[0].startswith(_REPLAY) else None
 
     def led_colour(self, number: int) -> str:
         """The name of the LED colour of the ``number``-th robot, from 0; where nobody films them they may repeat."""
         return self.led.colours[number % len(self.led.colours)]
 
+    def holding(self, profile: RobotProfile) -> Settings:
+        """The same by this profile, in the place of a file that is not to be read again."""
+        held = self.model_copy(update={"robot_profile": None})
+        held._held_profile = profile
+        return held
+
     def profile(self) -> RobotProfile:
         """What the driver takes the robot for. Raises RequestError for a profile that cannot be read."""
+        if self._held_profile is not None:
+            return self._held_profile
         profile = load_profile(self.robot_profile) if self.robot_profile is not None else RobotProfile()
         if self.motion.cm_s_per_unit is not None:
             profile = replace(profile, cm_s_per_unit=self.motion.cm_s_per_unit)
         return profile
 
-    def seeds(self) -> tuple[np.random.SeedSequence, np.random.SeedSequence]:
-        """Independent seeds of the virtual world and of the robot's turns."""
-        world, turns = np.random.SeedSequence(self.seed).spawn(2)
+    def seeds(self, part: int = 0) -> tuple[np.random.SeedSequence, np.random.SeedSequence]:
+        """Independent seeds of the virtual world and of the robot's turns; others in each resumed ``part``."""
+        # The first part's have the keys (0,) and (1,), which their own children begin with.
+        whole = np.random.SeedSequence(self.seed, spawn_key=(1 + part,) if part else ())
+        world, turns = whole.spawn(2)
         return world, turns
 
     def true_optics(self) -> tuple[Pinhole, Pinhole]:
@@ -334,28 +367,36 @@ def _device(role: str, spec: str, kinds: dict[str, bool]) -> None:
         raise ValueError(f"{role} = {spec!r} is no device; use one of {forms}")
 
 
-def load_settings(path: Path | None, overrides: dict[str, Any] | None = None, *, simulate: bool = False) -> Settings:
+def load_settings(
+    path: Path | None,
+    overrides: dict[str, Any] | None = None,
+    *,
+    simulate: bool = False,
+    base: dict[str, Any] | None = None,
+) -> Settings:
     """Read a session's TOML (none: the defaults) and lay ``overrides`` (dotted keys) over it.
 
-    ``simulate`` puts a virtual device in the place of each real one.
+    ``simulate`` puts a virtual device in the place of each real one. ``base``: what stands for the TOML without one.
 
     Raises:
         RequestError: the file cannot be read or a key is unknown or out of range; the line names it.
     """
-    data: dict[str, Any] = {}
+    data: dict[str, Any] = copy.deepcopy(base or {})
     if path is not None:
         try:
-            data = tomllib.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise RequestError(f"{path}: {error.strerror or 'cannot be read'}; check the path") from error
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise RequestError(f"{path} is not TOML: {error}") from error
+            data = toml_of(read_given(path))
+        except ValueError as error:
+            raise RequestError(one_line(f"{path} is not TOML: {error}")) from error
     for dotted, value in (overrides or {}).items():
         section = data
         *parents, key = dotted.split(".")
         for parent in parents:
-            section = section.setdefault(parent, {})
-        section[key] = value
+            inner: Any = section.setdefault(parent, {})
+            if not isinstance(inner, dict):  # no table: refused below
+                break
+            section = cast("dict[str, Any]", inner)
+        else:
+            section[key] = value
     if simulate:
         asked: Any = data.get("robot", "virtual")
         robots = cast("list[Any]", asked) if isinstance(asked, list) else [asked]
@@ -381,4 +422,4 @@ def parse_settings(data: dict[str, Any], *, origin: str) -> Settings:
         if fault["type"] == "extra_forbidden":
             reason = "is not a setting; see docs for the list, or take it out"
         message = f"{origin}: {where} {reason}"
-        raise RequestError(" ".join(message.split())) from error  # a key may hold line breaks
+        raise RequestError(one_line(message)) from error  # a key may hold line breaks

@@ -18,9 +18,9 @@ from analysis.bandtest import (
 from analysis.compare import chord_lengths, compare_chords_by_line
 from analysis.exploration import Turning
 from lab.base.errors import RequestError
-from lab.finalize import Tables
 from lab.recognisers import sensor_model
 from lab.settings import Settings
+from lab.store.tables import Tables
 from projector.shape import Silhouette
 from robot.turning import Policy
 
@@ -37,7 +37,7 @@ def check_against_simulation(
         None where nothing is to be compared: several robots cut each other's lines short, there are too few lines,
         or the shape reaches out of what the robot can reach.
     """
-    lines = tables.lines[tables.lines["counts"] & (tables.lines["k"] > 0)]
+    lines = tables.crossed
     count = len(lines)
     if len(settings.robots) > 1 or count < 2 * FIRST_LINES:
         return None

@@ -8,13 +8,15 @@ the cuts.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import pandas as pd
 
 from analysis.estimate import Estimate, estimate_from_moments
+from lab.base.errors import RequestError
 from lab.run import EDGES, Run
 from lab.settings import Settings
 from robot.cutlines import CutLine, estimate_interrupted
@@ -25,6 +27,7 @@ from robot.turning import NOWHERE_CM, line_weight
 # The weights of pairs follow the path per cut, which is only known as cuts happen. The sums are made anew
 # when it has moved by this much, a few dozen times in the longest session.
 _DRIFT = 0.02
+_CUT_COLUMNS = ("starts_lit", "ends_lit", "end_cm", "ended")
 
 
 class Estimates(Protocol):
@@ -61,6 +64,11 @@ class Line:
     l1_cm: float
     l3_cm3: float
 
+    @classmethod
+    def stored(cls, record: Mapping[str, Any]) -> Line:
+        """What a run once added, from its record in the log."""
+        return cls(*(record[name] for name in cls.__slots__))
+
 
 class Tally(Protocol):
     """The sums of a session."""
@@ -72,6 +80,10 @@ class Tally(Protocol):
 
     def add(self, run: Run) -> Line:
         """Take a finished run."""
+        ...
+
+    def take(self, record: Mapping[str, Any]) -> None:
+        """Take a run from its record in the log: the sums are those that ``add`` made of it, bit for bit."""
         ...
 
     @property
@@ -100,8 +112,17 @@ class SoloTally:
     def add(self, run: Run) -> Line:
         """Take a finished run; only those from edge to edge are lines of the statistics."""
         weight = line_weight(self._motion.turning, self._motion.weighting, run.rolled_cm) if run.is_line else 1.0
-        estimator = self._estimator if run.is_line else Estimator(covariance=False)
-        return Line(run.is_line, weight, *_invariants(run, estimator, weight))
+        line = Line(run.is_line, weight, *_invariants(run))
+        self._take(line)
+        return line
+
+    def take(self, record: Mapping[str, Any]) -> None:
+        """Take a run from its record in the log."""
+        self._take(Line.stored(record))
+
+    def _take(self, line: Line) -> None:
+        if line.counts:
+            self._estimator.add_line(line.k, line.l1_cm, line.l3_cm3, line.weight)
 
 
 class SharedTally:
@@ -121,16 +142,23 @@ class SharedTally:
         """Take a finished run."""
         # One that never got away, from a wall or from another robot, is no line; nor is one whose end is unknown.
         counts = run.ended != "link" and run.length_cm > NOWHERE_CM
-        invariants = _invariants(run, Estimator(covariance=False), 1.0)
+        line = Line(counts, 1.0, *_invariants(run))
         if counts:
-            self.n += invariants[0] > 0
-            self._take(as_cut_line(run))
-        return Line(counts, 1.0, *invariants)
+            self._take(line, as_cut_line(run))
+        return line
 
-    def _take(self, line: CutLine) -> None:
-        self._lines.append(line)
+    def take(self, record: Mapping[str, Any]) -> None:
+        """Take a run from its record in the log."""
+        line = Line.stored(record)
+        if line.counts:
+            points = [(s_cm, entering) for _, s_cm, entering in record["crossings"]]
+            self._take(line, _cut_line(points, *(record[name] for name in _CUT_COLUMNS)))
+
+    def _take(self, line: Line, rolled: CutLine) -> None:
+        self.n += line.k > 0
+        self._lines.append(rolled)
         merged = self._merged
-        line.into(merged)
+        rolled.into(merged)
         wanted_cm, used_cm = path_per_cut(merged.lit_cm, merged.cuts), merged.path_per_cut_cm
         if not (wanted_cm == used_cm or abs(wanted_cm - used_cm) <= _DRIFT * used_cm < math.inf):
             self._merged = estimate_interrupted(self._lines)
@@ -138,14 +166,16 @@ class SharedTally:
 
 def as_cut_line(run: Run) -> CutLine:
     """A run without the crossings at its own ends, which are none of the shape's."""
-    crossings = run.crossings[int(run.starts_lit) : len(run.crossings) - int(run.ends_lit)]
-    return CutLine(
-        [crossing.s_cm for crossing in crossings],
-        [crossing.entering for crossing in crossings],
-        run.starts_lit,
-        run.path_cm(run.t_end_s),
-        cut=not run.at_edge,
-    )
+    points = [(crossing.s_cm, crossing.entering) for crossing in run.crossings]
+    return _cut_line(points, run.starts_lit, run.ends_lit, run.path_cm(run.t_end_s), run.ended)
+
+
+def _cut_line(
+    points: Sequence[tuple[float, bool]], starts_lit: bool, ends_lit: bool, end_cm: float, ended: str
+) -> CutLine:
+    own = points[int(starts_lit) : len(points) - int(ends_lit)]
+    s_cm, entering = [s_cm for s_cm, _ in own], [entering for _, entering in own]
+    return CutLine(s_cm, entering, starts_lit, end_cm, cut=ended not in EDGES)
 
 
 def stored_estimate(lines: pd.DataFrame, crossings: pd.DataFrame) -> Estimate | None:
@@ -164,7 +194,10 @@ def stored_estimate(lines: pd.DataFrame, crossings: pd.DataFrame) -> Estimate | 
         scale = crossed["weight"] / crossed["weight"].mean()
         moments = np.column_stack([scale * crossed[name] for name in ("k", "l1_cm", "l3_cm3")])
         return estimate_from_moments(len(crossed), moments.mean(axis=0), np.cov(moments, rowvar=False))
-    found = estimate_interrupted(stored_cut_lines(counted, crossings))
+    try:
+        found = estimate_interrupted(stored_cut_lines(counted, crossings))
+    except ValueError as error:
+        raise RequestError(f"the log's lines do not add up: {error}") from error
     if found.lines < 2:
         return None
     area_area, area_perimeter, perimeter_perimeter = found.covariance()
@@ -177,14 +210,8 @@ def stored_cut_lines(lines: pd.DataFrame, crossings: pd.DataFrame) -> list[CutLi
     points: dict[int, list[tuple[float, bool]]] = {}
     for line, s_cm, entering in crossings[["line", "s_cm", "entering"]].itertuples(index=False):
         points.setdefault(line, []).append((s_cm, entering))
-    made: list[CutLine] = []
-    columns = ["line", "starts_lit", "ends_lit", "end_cm", "ended"]
-    for line, starts_lit, ends_lit, end_cm, ended in lines[columns].itertuples(index=False):
-        own = points.get(line, [])
-        own = own[int(starts_lit) : len(own) - int(ends_lit)]
-        s_cm, entering = [s_cm for s_cm, _ in own], [entering for _, entering in own]
-        made.append(CutLine(s_cm, entering, starts_lit, end_cm, cut=ended not in EDGES))
-    return made
+    columns = lines[["line", *_CUT_COLUMNS]].itertuples(index=False)
+    return [_cut_line(points.get(line, []), *ends) for line, *ends in columns]
 
 
 def tally_for(settings: Settings) -> Tally:
@@ -192,9 +219,17 @@ def tally_for(settings: Settings) -> Tally:
     return SoloTally(settings) if len(settings.robots) == 1 else SharedTally()
 
 
-def _invariants(run: Run, estimator: Estimator, weight: float) -> tuple[int, float, float]:
-    """Take a run's crossings through an on-board estimator: (k, L1, L3)."""
+def invariants_of(points: Iterable[tuple[float, bool]]) -> tuple[int, float, float]:
+    """Take a run's crossings, each (s_cm, entering), through an on-board estimator of its own: (k, L1, L3).
+
+    Raises ValueError for crossings that do not alternate, or run backwards.
+    """
+    estimator = Estimator(covariance=False)
     estimator.start_line()
-    for crossing in run.crossings:
-        estimator.crossing(crossing.s_cm, crossing.entering)
-    return estimator.end_line(weight=weight)
+    for s_cm, entering in points:
+        estimator.crossing(s_cm, entering)
+    return estimator.end_line()
+
+
+def _invariants(run: Run) -> tuple[int, float, float]:
+    return invariants_of((crossing.s_cm, crossing.entering) for crossing in run.crossings)

@@ -13,14 +13,16 @@ from numpy.typing import NDArray
 
 from analysis.edgeshift import FEWEST_EDGES, EdgeShift, Outline, Ramps, fit_edge_shift, ramp_of_line
 from analysis.replay import Passes
+from lab.parts import LearntLevels
 from lab.run import EDGES
 from lab.settings import Settings
-from lab.store import LIGHT, SessionReader, line_folder
+from lab.store.layout import LIGHT
+from lab.store.reader import SessionReader, numbers_of
 from projector.shape import Silhouette
 from tracking.runs import place_along
 
 if TYPE_CHECKING:
-    from lab.review import Filmed
+    from lab.filmed import Filmed
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -54,21 +56,12 @@ class Readings:
         return variance if variance < (_LARGEST_JITTER * interval_s) ** 2 else math.nan
 
 
-def levels_of(manifest: Mapping[str, Any]) -> dict[str, Mapping[str, float]]:
-    """The light levels that a session learnt, by robot; those of the first also under the empty name."""
-    robots = manifest.get("devices", {}).get("robots", [])
-    known = {robot["name"]: robot["levels"]["shape"] for robot in robots if robot.get("levels")}
-    if manifest.get("levels"):
-        known[""] = manifest["levels"]
-    return known
-
-
 def readings_of(session: SessionReader, line: int, levels: Mapping[str, float] | None) -> Readings:
     """The samples of a run; without levels their light is NaN, and a robot that keeps its samples has none."""
-    path = line_folder(session.folder, line) / LIGHT
+    path = session.line_path(line, LIGHT)
     if not path.exists():
         return Readings(np.empty(0), np.empty(0))
-    table = pd.read_parquet(path, columns=["t_host_s", "light_lux"])
+    table = numbers_of(path, ("t_host_s", "light_lux"))
     t_s, lux = (np.asarray(table[name], dtype=float) for name in ("t_host_s", "light_lux"))
     if levels is None:
         return Readings(t_s, np.full(len(t_s), np.nan))
@@ -118,7 +111,7 @@ def watch(
         filmed: what the camera saw.
         path_per_cut_cm: of lines that robots cut short; infinite where none is cut.
     """
-    count, levels = len(lines), levels_of(session.manifest)
+    count, levels = len(lines), LearntLevels.of(session)
     several = lines["robot"].nunique() > 1
     # whole lines that pass through the shape may as well be endless; their ends in the film are less sure than that
     endless = not several and settings.arena.lines_within.contains(geometry)
@@ -143,7 +136,7 @@ def watch(
         if several:
             cuts = (True, ended not in EDGES)
             cut[row] = cuts if begin < end else cuts[::-1]
-        read = readings_of(session, line, levels.get(robot, levels.get("")))
+        read = readings_of(session, line, levels.get(line, robot))
         while_seen = (read.t_s > t_s[0]) & (read.t_s < t_s[-1])
         read = Readings(read.t_s[while_seen], read.light[while_seen])
         places = np.interp(read.t_s, t_s, s_cm)

@@ -14,6 +14,7 @@ from shapely.geometry import LinearRing, MultiPolygon, Polygon, mapping
 from shapely.validation import explain_validity
 
 from lab.base.files import write_aside
+from lab.base.given import json_of
 from projector.fill import check_tangle
 from projector.fill import mend as untangle
 from projector.shape import (
@@ -76,11 +77,9 @@ def load_json(path: Path) -> Any:
         text = path.read_text(encoding="utf-8-sig")
         if not text.strip():
             raise ShapeError(str(path), "the file is empty; save the drawing again")
-        return json.loads(text)
+        return json_of(text)
     except ValueError as error:  # no UTF-8, no JSON, or a number of thousands of digits
         raise ShapeError(str(path), f"is not JSON ({error}); save it again as GeoJSON") from error
-    except RecursionError as error:
-        raise ShapeError(str(path), "is nested too deeply to be GeoJSON; save it again") from error
 
 
 def parse_drawing(data: Any, subject: str, *, mend: bool = False) -> Drawing:

@@ -40,7 +40,7 @@ def installed_font(family: str) -> Path | None:
     except ValueError:
         pass
     listed = {entry.fname for entry in fontManager.ttflist}
-    for path in sorted(set(findSystemFonts()) - listed):
+    for path in sorted(installed_files() - listed):
         try:
             face = get_font(path)
         except (OSError, RuntimeError):  # no font after all
@@ -48,6 +48,11 @@ def installed_font(family: str) -> Path | None:
         if face.family_name == family and face.style_name in _UPRIGHT:
             return Path(path)
     return None
+
+
+def installed_files() -> set[str]:
+    """The files of all fonts that matplotlib's font manager finds on this system."""
+    return {entry.fname for entry in fontManager.ttflist} | set(findSystemFonts())
 
 
 class _FlatPen(BasePen):

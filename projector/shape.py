@@ -16,6 +16,7 @@ from shapely.geometry import LinearRing, MultiPolygon, Polygon
 from shapely.validation import explain_validity
 
 from lab.base.errors import RequestError
+from lab.base.given import one_line
 
 Silhouette = Polygon | MultiPolygon
 Floats = NDArray[np.float64]
@@ -39,8 +40,8 @@ class ShapeError(RequestError):
 
     def __init__(self, subject: str, problem: str) -> None:
         self.subject = subject
-        # a text or a file's name may hold line breaks; a message is one line
-        super().__init__(" ".join(f"{subject}: {problem}".splitlines()))
+        # a text or a file's name may hold line breaks, and what steers a terminal
+        super().__init__(f"{one_line(subject, 400)}: {one_line(problem)}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -121,7 +121,9 @@ def _tag(element: ElementTree.Element) -> str:
 def _check_elements(root: ElementTree.Element, subject: str) -> None:
     """Refuse what cannot be drawn truly, and `use` elements that would multiply without end."""
     known: dict[str, ElementTree.Element] = {}
-    for element in root.iter():
+    for count, element in enumerate(root.iter(), start=1):
+        if count > MAX_ELEMENTS:
+            raise ShapeError(subject, f"draws more than {MAX_ELEMENTS} elements; simplify the drawing")
         tag = _tag(element)
         if tag in _REFUSED:
             raise ShapeError(subject, f"holds a <{tag}>, which has no filled outline of its own; {_REFUSED[tag]}")

@@ -18,7 +18,7 @@ from shapely.affinity import translate
 from shapely.geometry import MultiPolygon, Polygon
 
 from projector.fill import fill
-from projector.outlines import Outlines, installed_font, open_outlines
+from projector.outlines import Outlines, installed_files, installed_font, open_outlines
 from projector.shape import FIT_WIDTH_CM, Font, Shape, ShapeError, Silhouette, fit, size_of
 
 Floats = NDArray[np.float64]
@@ -59,6 +59,11 @@ def find_font(path: str | Path | None = None, families: Sequence[str] = HELVETIC
     font = _record(standing_in, fallback=True)
     _log.warning("none of %s is installed; %s stands in (choose with --font PATH)", ", ".join(families), font.name)
     return font
+
+
+def is_installed(path: Path) -> bool:
+    """Whether a font's file is one of this system's."""
+    return path.is_absolute() and str(path) in installed_files()
 
 
 def _record(path: Path, *, fallback: bool) -> Font:

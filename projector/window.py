@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from projector.device import ProjectorError, ProjectorRequestError, check_image, now_s
 
+_NO_DESKTOP = "no display can be opened ({}); run it in a desktop session"
+_PRETENDED = ("offscreen", "dummy")  # what SDL takes where there is no screen
 _EXTRA = "pygame-ce is missing; pip install chordlab[projector]"
 
 # What SDL must know before it starts; whoever sets these in the environment has the last word.
@@ -41,6 +43,26 @@ def _listed(sizes: Sequence[tuple[int, int]]) -> str:
     return ", ".join(f"display:{n} ({width} x {height})" for n, (width, height) in enumerate(sizes))
 
 
+def display_sizes() -> list[tuple[int, int]]:
+    """(width, height) in pixels of every display there is, in the order of their numbers.
+
+    Raises:
+        ProjectorError: pygame is missing, or there is no desktop.
+    """
+    pygame = _import_pygame()
+    was_open = pygame.display.get_init()
+    try:
+        pygame.display.init()
+        if pygame.display.get_driver() in _PRETENDED:
+            raise ProjectorError(_NO_DESKTOP.format("none is there"))
+        return [(int(width), int(height)) for width, height in pygame.display.get_desktop_sizes()]
+    except pygame.error as error:
+        raise ProjectorError(_NO_DESKTOP.format(error)) from error
+    finally:
+        if not was_open:
+            pygame.display.quit()
+
+
 class Window:
     """Shows images full screen on display ``display`` (0 is the main one), pixel for pixel.
 
@@ -69,7 +91,7 @@ class Window:
             pygame.display.init()
             sizes: list[tuple[int, int]] = pygame.display.get_desktop_sizes()
         except pygame.error as error:
-            raise ProjectorError(f"no display can be opened ({error}); run it in a desktop session") from error
+            raise ProjectorError(_NO_DESKTOP.format(error)) from error
         if not 0 <= display < len(sizes):
             pygame.display.quit()
             raise ProjectorRequestError(

@@ -134,6 +134,14 @@ def learn_levels(dark_lux: ArrayLike, bright_lux: ArrayLike, *, separation: floa
     return Levels(dark_lux=low_level, bright_lux=high_level, low_lux=mid - margin, mid_lux=mid, high_lux=mid + margin)
 
 
+def scatter_of(levels: Levels) -> float:
+    """How far, lux, samples may lie to either side of the dark and the bright level for `learn_levels` to find these.
+
+    Half of them must lie below and half above.
+    """
+    return (levels.mid_lux - levels.low_lux) / (MARGIN_NOISES * _MAD_TO_SIGMA)
+
+
 class CrossingDetector:
     """Crossings of one run after another, sample by sample, in constant memory.
 

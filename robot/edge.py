@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -274,6 +274,15 @@ class Rover(Protocol):
         ``until`` is shown every sample from the command to the rest, also those after it has said yes. Returns
         whether it did.
         """
+        ...
+
+
+@runtime_checkable
+class KnowsEdge(Protocol):
+    """A robot that need not feel the edge of light that it stopped at: one that is played back."""
+
+    async def felt_edge(self) -> FeltEdge | None:
+        """What the manoeuvre found; None where it found nothing."""
         ...
 
 

@@ -318,6 +318,8 @@ class SelfGuided:
 
     def _on_half(self, data: bytes) -> None:
         half = wire.unpack(wire.LINE_FORMAT, data)
+        if not all(map(math.isfinite, half)):
+            raise ValueError("a line's lengths are no numbers")
         self._half = half if half[0] == self._session else None
 
     def _on_estimate(self, data: bytes) -> None:

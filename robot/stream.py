@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from robot import commands
 from robot.commands import Request, StreamLayout
 from robot.device import Attitude, Sample
-from robot.errors import DriveError
+from robot.errors import DriveError, PayloadError
 
 _CM_PER_M = 100.0
 _LONGEST_MS = 0xFFFF
@@ -63,7 +63,7 @@ class Stream:
         """The records of one frame that arrived at ``t_host_s``.
 
         Raises:
-            PayloadError: The frame does not hold what was asked for.
+            PayloadError: The frame does not hold what was asked for, or a place or velocity that is no number.
         """
         attitude = None
         values = self.layout.decode(data)
@@ -71,6 +71,9 @@ class Stream:
             pitch_deg, roll_deg, yaw_deg, *values = values
             attitude = Attitude(t_host_s, math.radians(pitch_deg), math.radians(roll_deg), math.radians(yaw_deg))
         x_m, y_m, velocity_x_m_s, velocity_y_m_s, light_lux = values
+        # Light that is no number counts as lost; a place that is none would spoil the rest of the run.
+        if not math.isfinite(x_m + y_m + velocity_x_m_s + velocity_y_m_s):
+            raise PayloadError(commands.SENSOR_DATA.name, data, expected="finite numbers")
         scale = _CM_PER_M * self.locator_scale
         speed_cm_s = scale * math.hypot(velocity_x_m_s, velocity_y_m_s)
         return Sample(t_host_s, light_lux, scale * x_m, scale * y_m, speed_cm_s), attitude

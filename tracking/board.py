@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from lab.base.errors import RequestError
 from lab.base.files import write_aside
+from lab.base.given import read_given
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -36,7 +37,7 @@ _MARKER_CELLS = 6
 _CM_PER_INCH = 2.54
 _PAPER_CM = {"A4": (29.7, 21.0), "A3": (42.0, 29.7)}
 _TAG = "chordlab-board columns={columns} rows={rows} square_cm={square_cm:g}"
-_TAG_FORM = re.compile(rb"chordlab-board columns=(\d+) rows=(\d+) square_cm=([0-9.]+)")
+_TAG_FORM = re.compile(rb"chordlab-board columns=(\d{1,3}) rows=(\d{1,3}) square_cm=(\d{1,9}(?:\.\d{1,9})?)")
 _MOST_MARKERS = 100
 
 
@@ -171,9 +172,9 @@ def draw_sheet(board: Board, paper: str) -> Figure:
 def read_board(path: Path) -> Board:
     """The board that a PDF by `print_board` holds. Raises BoardError where it holds none or cannot be read."""
     try:
-        found = _TAG_FORM.search(path.read_bytes())
-    except OSError as error:
-        raise BoardError(f"{path}: cannot read the board ({error.strerror}); check the path") from error
+        found = _TAG_FORM.search(read_given(path))
+    except RequestError as error:
+        raise BoardError(f"cannot read the board {error}") from error
     if found is None:
         raise BoardError(f"{path} holds no chordlab board; make one with chordlab calibrate camera --make-board {path}")
     columns, rows, square_cm = found.groups()

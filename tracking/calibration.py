@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lab.base.errors import RequestError
 from lab.base.files import write_aside
+from lab.base.given import json_of, one_line, read_given
 from lab.base.pinhole import Pinhole
 
 DEFAULT_LED_HEIGHT_CM = 7.3
@@ -86,7 +87,7 @@ class Calibration:
             led_height_cm = float(data["led_height_cm"])
         except KeyError as error:
             raise CalibrationError("calibration: `led_height_cm` is missing; add it or calibrate again") from error
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise CalibrationError("calibration: `led_height_cm` must be a number of cm") from error
         return cls(Pinhole.from_dict(data), led_height_cm)
 
@@ -99,19 +100,17 @@ def load_calibration(path: str | Path) -> Calibration:
     """
     file = Path(path)
     try:
-        data: Any = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise CalibrationError(
-            f"{file}: cannot read the calibration ({error.strerror}); check the path", file
-        ) from error
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        data: Any = json_of(read_given(file))
+    except RequestError as error:
+        raise CalibrationError(f"cannot read the calibration {error}", file) from error
+    except ValueError as error:
         raise CalibrationError(f"{file}: not a JSON file; give a calibration.json", file) from error
     if not isinstance(data, dict):
         raise CalibrationError(f"{file}: a calibration is one JSON object; give a calibration.json", file)
     try:
         return Calibration.from_dict(cast("dict[str, Any]", data))
     except RequestError as error:
-        raise CalibrationError(f"{file}: {error}", file) from error
+        raise CalibrationError(one_line(f"{file}: {error}"), file) from error
 
 
 def save_calibration(calibration: Calibration, path: str | Path) -> None:

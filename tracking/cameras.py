@@ -7,12 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lab.base.errors import ChordlabError, RequestError
+
+if TYPE_CHECKING:
+    from tracking.coded import CodedFrame
 
 Plane = NDArray[np.uint8]
 
@@ -42,12 +45,14 @@ class Frame:
         t_camera_s: time on the camera's own clock (middle of the exposure where it is known).
         t_host_s: time on the host's clock, the event loop's, when the frame reached us.
         i420: (h · 3/2, w) uint8, the planes Y, U, V one after the other as encoders take them.
+        coded: the frame as an encoder made it, where it comes from a film.
     """
 
     index: int
     t_camera_s: float
     t_host_s: float
     i420: Plane
+    coded: CodedFrame | None = None
 
     @property
     def size(self) -> tuple[int, int]:

@@ -35,6 +35,7 @@ def write_preview(
     *,
     tail_s: float = 1.0,
     rate_hz: float | None = None,
+    starts_s: Sequence[float] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Draw position, tail and LED state of each robot over the video.
@@ -49,6 +50,7 @@ def write_preview(
         out_path: the preview, .mp4 or .mkv (H.264).
         tail_s: length of the tail in s.
         rate_hz: frames a second of the preview; default the video's own times.
+        starts_s: when each video begins in the preview; default each a frame after the one before.
         progress: called now and then with (frames drawn, frames in all).
 
     Returns:
@@ -67,8 +69,9 @@ def write_preview(
     total = sum(int(table["frame"].max()) + 1 if len(table) else 0 for table in tracks)
     with _Writer(Path(out_path)) as writer:
         drawn, start_s = 0, 0.0
-        for file, table in zip(videos, tracks, strict=True):
+        for number, (file, table) in enumerate(zip(videos, tracks, strict=True)):
             robots = _by_robot(table)
+            start_s = start_s if starts_s is None else starts_s[number]
             with read_frames(file, quiet=True) as reader:
                 period_s = 1.0 / (rate_hz or reader.info.rate_hz)
                 tail = max(1, round(tail_s * reader.info.rate_hz))

@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 
 from lab.base.errors import RequestError
 from tracking.cameras import Frame
+from tracking.coded import CodedFrame
 
 _TIME_BASE = Fraction(1, 1000)  # Matroska's own default; finer stamps are in the table
 
@@ -128,26 +129,42 @@ class SegmentWriter:
         self._stream: VideoStream | None = None
         self._rows: list[tuple[int, float, float, int]] = []
         self._codec = settings.encoder()
+        self._source: CodedFrame | None = None
 
     def add(self, frame: Frame) -> None:
-        """Encode one frame. Raises OSError or FFmpegError where the disk or the encoder fails."""
+        """Encode one frame, or copy it. Raises OSError, ValueError or FFmpegError where the disk or the encoder fails.
+
+        A segment that begins with a frame from a film, one that stands by itself, is copied from there.
+        """
         if self._container is None or self._stream is None:
+            self._source = frame.coded if frame.coded is not None and frame.coded.key else None
             self._container, self._stream = self._begin(frame.size)
-        # Motion JPEG knows only the full range; naming the planes so keeps their values as they are.
-        layout = "yuvj420p" if self._codec == "mjpeg" else "yuv420p"
-        picture = av.VideoFrame.from_numpy_buffer(np.ascontiguousarray(frame.i420), format=layout)
         pts = max(round(frame.t_camera_s / _TIME_BASE), self._last_pts + 1)
-        picture.pts, picture.time_base = pts, _TIME_BASE
         self._last_pts = pts
-        self._container.mux(self._stream.encode(picture))
+        if self._source is None:
+            self._container.mux(self._stream.encode(self._picture(frame, pts)))
+        elif frame.coded is not None and frame.coded.decodes_as(self._source):
+            packet = frame.coded.packet(pts, _TIME_BASE)
+            packet.stream = self._stream
+            self._container.mux(packet)
+        else:
+            raise ValueError("a film that is copied goes on with frames of another kind")
         before = 0 if self._last_index is None else max(0, frame.index - self._last_index - 1)
         self._last_index = frame.index
         self._rows.append((frame.index, frame.t_camera_s, frame.t_host_s, before))
 
+    def _picture(self, frame: Frame, pts: int) -> av.VideoFrame:
+        # Motion JPEG knows only the full range; naming the planes so keeps their values as they are.
+        layout = "yuvj420p" if self._codec == "mjpeg" else "yuv420p"
+        picture = av.VideoFrame.from_numpy_buffer(np.ascontiguousarray(frame.i420), format=layout)
+        picture.pts, picture.time_base = pts, _TIME_BASE
+        return picture
+
     def close(self) -> SegmentInfo:
         """Flush, sync and give the file and its table their names. Raises OSError or FFmpegError."""
         if self._container is not None and self._stream is not None:
-            self._container.mux(self._stream.encode(None))
+            if self._source is None:
+                self._container.mux(self._stream.encode(None))
             self._container.close()
             self._container = None
             # The table first: a video under its own name always has one.
@@ -161,7 +178,7 @@ class SegmentWriter:
             dropped=sum(row[3] for row in self._rows),
             t_first_s=times[0] if times else math.nan,
             t_last_s=times[-1] if times else math.nan,
-            codec=self._codec,
+            codec=self._codec if self._source is None else self._source.stream.codec_context.name,
             late=late_frames([row[1] for row in self._rows], [row[2] for row in self._rows], self._rate_hz),
         )
 
@@ -181,6 +198,8 @@ class SegmentWriter:
             format="matroska",
             options={"cluster_time_limit": "1000", "flush_packets": "1"},
         )
+        if self._source is not None:
+            return container, container.add_stream_from_template(self._source.stream)
         rate = Fraction(self._rate_hz).limit_denominator(1001)
         gop = max(1, round(settings.key_interval_s * self._rate_hz))
         if self._codec == "mjpeg":

@@ -94,7 +94,7 @@ class UsbCamera:
     ) -> None:
         self.settings = settings or UsbSettings()
         self._number = number
-        self._opener = opener or _open_device
+        self._opener = opener or open_device
         self._size = self.settings.size
         self._rate_hz = self.settings.rate_hz
         self._dropped = 0
@@ -294,5 +294,6 @@ def _median(values: Sequence[float] | deque[float]) -> float:
     return float(np.median(np.asarray(values, dtype=float)))
 
 
-def _open_device(number: int) -> Capture:
+def open_device(number: int) -> Capture:
+    """OpenCV's own way to camera ``number``; ask ``isOpened`` whether there is one."""
     return cast("Capture", cv2.VideoCapture(number))

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
-import sys
-import threading
 from collections.abc import Generator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -15,6 +13,7 @@ from pathlib import Path
 import cv2
 import pandas as pd
 
+from lab.base.interrupts import interrupt_held
 from tracking.background import Background
 from tracking.calibration import Calibration
 from tracking.passes import RawTrack, follow_one
@@ -57,7 +56,7 @@ def follow_each(
         return
     context = multiprocessing.get_context("spawn")
     stop = context.Event()  # with it comes multiprocessing's resource tracker, whose start unblocks signals
-    with _interrupt_held() as came:
+    with interrupt_held() as came:
         pool = ProcessPoolExecutor(
             workers, mp_context=context, initializer=_Job.prepare, initargs=(floor, calibration, stop)
         )
@@ -70,30 +69,6 @@ def follow_each(
     finally:
         stop.set()
         pool.shutdown(cancel_futures=True)
-
-
-@contextmanager
-def _interrupt_held() -> Generator[list[int]]:
-    """Start processes so that they never see the keyboard's interrupt; give a list that is not empty if it came.
-
-    In the middle of a start it would leave a process that nobody knows of. Processes inherit what is blocked; where
-    signals cannot be blocked (Windows), they ignore this one once they run.
-    """
-    came: list[int] = []
-    in_main = threading.current_thread() is threading.main_thread()
-    handler = signal.signal(signal.SIGINT, lambda number, _: came.append(number)) if in_main else None
-    try:
-        if sys.platform == "win32":
-            yield came
-        else:
-            blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-            try:
-                yield came
-            finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-    finally:
-        if in_main:
-            signal.signal(signal.SIGINT, handler)
 
 
 def _segment(file: Path, floor: Background, calibration: Calibration | None, stop: Event | None = None) -> Followed:

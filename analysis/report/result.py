@@ -32,6 +32,10 @@ _COLUMNS: Mapping[str, tuple[str, ...]] = {
 }
 
 
+ENDED_WELL = ("complete", "recognised", "replayed")
+"""End states of a session that came to its own end."""
+
+
 @dataclass(frozen=True, slots=True)
 class RunCheck:
     """The session's own runs against what isotropic lines predict.

@@ -329,19 +329,27 @@ def _undecided(result: SessionResult, measured: Estimate, rival: str, needed: fl
     return Problem(f"The recognition is not settled; the hardest rival is {title}.", step)
 
 
+def cure_of_sizes(area_rel: float, perimeter_rel: float) -> str:
+    """What to do about A and P that are off by these shares of the truth."""
+    if abs(area_rel - 2 * perimeter_rel) < 0.5 * abs(area_rel):
+        return (
+            "A deviates about twice as much as P, as a wrong speed or scale makes it: check `motion.cm_s_per_unit` in "
+            "the settings, then the projector's height."
+        )
+    return (
+        "Check the light threshold, the sensor's footprint and lost short chords; a slower robot or faster sampling "
+        "mends the latter."
+    )
+
+
 def _of_the_sizes(result: SessionResult, measured: Estimate) -> list[Problem]:
     problems: list[Problem] = []
     off = deviation(measured, result.exact)
     if off.p_value < UNLIKELY:
-        stretched = abs(off.area_rel - 2 * off.perimeter_rel) < 0.5 * abs(off.area_rel)
         problems.append(
             Problem(
                 f"A and P deviate more than chance allows (p {p_value(off.p_value)}).",
-                "A deviates about twice as much as P, as a wrong speed or scale makes it: check `motion.cm_s_per_unit` "
-                "in the settings, then the projector's height."
-                if stretched
-                else "Check the light threshold, the sensor's footprint and lost short chords; a slower robot or "
-                "faster sampling mends the latter.",
+                cure_of_sizes(off.area_rel, off.perimeter_rel),
             )
         )
     found = None if result.chord_pairs is None else agreement(result.chord_pairs)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 _GROUP = "\u202f"
 
@@ -68,3 +69,10 @@ def p_value(value: float) -> str:
     if not math.isfinite(value):
         return "unknown"
     return "< 0.001" if value < 0.001 else f"{value:.3f}"
+
+
+def listed(names: Sequence[str], most: int = 5) -> str:
+    """Write an enumeration: ``listed(["a", "b", "c"])`` is "a, b and c"; beyond ``most``, "a, b, … and 7 more"."""
+    if len(names) > most:
+        return f"{', '.join(names[:most])} and {len(names) - most} more"
+    return " and ".join(part for part in (", ".join(names[:-1]), names[-1]) if part) if names else ""

@@ -1,4 +1,4 @@
-"""One session's report as a single HTML file that needs nothing else: figures, style and text are inside."""
+"""A report as a single HTML file that needs nothing else: figures, style and text are inside."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from analysis.figures import pen
@@ -26,7 +26,7 @@ _PAGE_COLOURS = {pen.INK: "var(--ink)", pen.MUTED: "var(--muted)", pen.GRID: "va
 
 
 @dataclass(frozen=True, slots=True)
-class _Shown:
+class Shown:
     """A panel as the template takes it."""
 
     name: str
@@ -50,7 +50,11 @@ def write_report(result: SessionResult, path: Path) -> Path:
     Raises:
         ReportFileError: The file cannot be written.
     """
-    page = render_report(result)
+    return keep_page(render_report(result), path)
+
+
+def keep_page(page: str, path: Path) -> Path:
+    """Write a page whole or not at all, and return its path. Raises ReportFileError."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_aside(path, page.encode())
@@ -61,19 +65,24 @@ def write_report(result: SessionResult, path: Path) -> Path:
 
 def render_report(result: SessionResult) -> str:
     """Give the report of ``result`` as HTML text. The same result gives the same text."""
-    environment = Environment(
-        loader=PackageLoader("analysis", "report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True
-    )
-    environment.filters["typeset"] = _typeset
     panels, left_out = panels_of(result)
-    return environment.get_template("template.html.j2").render(
+    return page_of("template.html.j2").render(
         result=result,
         verdict=verdict_of(result),
-        panels=[_shown(panel) for panel in panels],
+        panels=[shown(panel) for panel in panels],
         left_out=left_out,
         tables=tables_of(result),
         provenance=provenance_of(result),
     )
+
+
+def page_of(template: str) -> Template:
+    """Give a template of this folder, which escapes all that is put into it."""
+    environment = Environment(
+        loader=PackageLoader("analysis", "report"), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+    )
+    environment.filters["typeset"] = _typeset
+    return environment.get_template(template)
 
 
 def _typeset(text: str) -> Markup:
@@ -83,10 +92,11 @@ def _typeset(text: str) -> Markup:
     return Markup("").join(code.format(part) if index % 2 else part for index, part in enumerate(text.split("`")))
 
 
-def _shown(panel: Panel) -> _Shown:
+def shown(panel: Panel) -> Shown:
+    """Make a figure ready for the page: inline SVG, or an image where that is smaller."""
     svg = svg_text(panel.figure)
     picture = _image(panel) if len(svg) > SVG_LIMIT else _inline(svg, panel)
-    return _Shown(panel.name, panel.title, panel.alt, panel.caption, picture)
+    return Shown(panel.name, panel.title, panel.alt, panel.caption, picture)
 
 
 def _image(panel: Panel) -> Markup:

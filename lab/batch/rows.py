@@ -1,102 +1,256 @@
-"""Many stored sessions, analysed one by one on every core; a broken one is a row with its reason."""
+"""One session's figures as one flat row."""
 
 from __future__ import annotations
 
-import multiprocessing
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+import hashlib
+import math
+import time
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-import pandas as pd
+import numpy as np
 
-from lab.base.errors import ChordlabError, RequestError
-from lab.review import review
-from lab.store import MANIFEST
+from analysis.estimate import Estimate
+from analysis.montecarlo import simulate
+from lab.filmed import Filmed
+from lab.findings import summarise, to_result
+from lab.review import Reviewed, examine
+from lab.spread.task import one_line
+from lab.store.layout import SessionFolderError, to_json
 
-Progress = Callable[[int, int], None]
+_FLOAT, _COUNT, _FLAG, _TEXT = "float64", "Int64", "boolean", "str"
+SIDES = (("area", "cm2"), ("perimeter", "cm"))
+TERMS = ("speed", "latency", "sampling", "footprint", "parallax", "anisotropy", "counting", "rest")
+TWINS = "; "
+_SIMULATED_RUNS, _SIMULATED_LINES = 1000, 4_000_000
 
-_TWINS = "; "
+
+def _sized(*names: str) -> dict[str, str]:
+    return {name.format(side=side, unit=unit): _FLOAT for name in names for side, unit in SIDES}
 
 
-def sessions_below(roots: Sequence[Path]) -> list[Path]:
-    """Every session folder at or below the roots, in order. Raises RequestError when there is none."""
-    for root in roots:
-        if not root.is_dir():
-            raise RequestError(f"{root}: no such folder; name folders that hold sessions")
-    found = sorted({manifest.parent for root in roots for manifest in root.rglob(MANIFEST)})
-    if not found:
-        raise RequestError(f"no session below {', '.join(map(str, roots))}; a session folder holds a {MANIFEST}")
-    return found
+# Every column of a batch's table, with its pandas dtype, in their order.
+COLUMNS: dict[str, str] = {
+    "session": _TEXT,
+    "root": _TEXT,
+    "folder": _TEXT,
+    "error": _TEXT,
+    "shape": _TEXT,
+    "lines": _COUNT,
+    "runs": _COUNT,
+    "rolling_s": _FLOAT,
+    **_sized("truth_{side}_{unit}", "robot_{side}_{unit}", "robot_sigma_{side}_{unit}"),
+    "robot_correlation": _FLOAT,
+    **_sized("camera_{side}_{unit}", "camera_sigma_{side}_{unit}"),
+    "camera_correlation": _FLOAT,
+    **_sized("exact_sigma_{side}_{unit}", "simulated_sigma_{side}_{unit}"),
+    **_sized("{side}_error_rel", "camera_{side}_error_rel", "{side}_z", "{side}_z_exact"),
+    "recognised_name": _TEXT,
+    "recognised_posterior": _FLOAT,
+    "recognised_twins": _TEXT,
+    "recognised_unknown": _FLOAT,
+    "recognised_right": _FLAG,
+    "chords_matched": _COUNT,
+    "chords_missed": _COUNT,
+    "chords_extra": _COUNT,
+    "chords_bias_cm": _FLOAT,
+    "chords_sd_cm": _FLOAT,
+    "chords_scale": _FLOAT,
+    "latency_entering_s": _FLOAT,
+    "latency_entering_sigma_s": _FLOAT,
+    "latency_leaving_s": _FLOAT,
+    "latency_leaving_sigma_s": _FLOAT,
+    "latency_jitter_s": _FLOAT,
+    "isotropy_p_value": _FLOAT,
+    "isotropy_bias": _FLOAT,
+    **_sized("isotropy_{side}_rel"),
+    "homogeneity_p_value": _FLOAT,
+    "run_length_mean_cm": _FLOAT,
+    "run_length_p_value": _FLOAT,
+    "montecarlo_p_value": _FLOAT,
+    "montecarlo_inside": _FLAG,
+    **{name: _FLOAT for term in TERMS for name in _sized(f"budget_{{side}}_{term}_percent")},
+    "budget_closes": _FLAG,
+    "filter_honest": _FLAG,
+    "filter_mean_nis": _FLOAT,
+    "straight": _FLAG,
+    "bend_cm": _FLOAT,
+    "checksums_ok": _FLAG,
+    "end_state": _TEXT,
+    "runs_given_up": _COUNT,
+    "link_losses": _COUNT,
+    "frames": _COUNT,
+    "frames_dropped": _COUNT,
+    "frames_late": _COUNT,
+    "parts": _COUNT,
+    "verdict": _TEXT,
+    "started": _TEXT,
+    "seed": _TEXT,
+    "virtual": _FLAG,
+    "robots": _TEXT,
+    "firmware": _TEXT,
+    "schema_version": _COUNT,
+    "chordlab_version": _TEXT,
+    "content_digest": _TEXT,
+    "settings_digest": _TEXT,
+    "seconds": _FLOAT,
+}
 
 
 def row_of(folder: Path) -> dict[str, Any]:
-    """One session's figures as one flat row; ``error`` says why there are none."""
+    """Examine a session and give its row, in plain JSON values; what is not known is not in it.
+
+    Nothing is written in the folder. What fails, of whatever kind, is the row's ``error`` in one line.
+    """
+    start_s = time.perf_counter()
     try:
-        summary = review(folder, report=False, workers=1)
-    except (ChordlabError, OSError, ValueError, KeyError) as error:
-        return {"session": folder.name, "folder": str(folder), "error": " ".join(str(error).split()) or repr(error)}
-    row: dict[str, Any] = {"session": folder.name, "folder": str(folder), "error": ""}
-    row.update(_flat(summary))
-    return row
+        if not folder.is_dir():
+            raise SessionFolderError(folder, "is not there; a cluster's workers need it under the same path")
+        row = dict(_figures(examine(folder, workers=1)))
+    except Exception as error:  # noqa: BLE001 - a broken session is a row, whatever breaks in it
+        return {"error": one_line(error) or type(error).__name__}
+    known = {name: _plain(value) for name, value in row.items()}
+    return {
+        "error": "",
+        **{name: value for name, value in known.items() if value is not None},
+        "seconds": time.perf_counter() - start_s,
+    }
 
 
-def _flat(summary: dict[str, Any]) -> Iterator[tuple[str, Any]]:
-    for name, value in summary.items():
-        if name in ("folder", "report"):
-            continue
-        if isinstance(value, dict):
-            for inner, item in value.items():  # pyright: ignore[reportUnknownVariableType]: a summary's section
-                if inner == "twins" and isinstance(item, list):
-                    yield f"{name}_{inner}", _TWINS.join(map(str, item))  # pyright: ignore[reportUnknownArgumentType]: names
-                elif not isinstance(item, (list, dict)):
-                    yield f"{name}_{inner}", item
-        else:
-            yield name, value
+def _figures(found: Reviewed) -> Iterator[tuple[str, Any]]:
+    yield from {"shape": found.shape.name, "runs": len(found.tables.lines)}.items()
+    lines = found.tables.lines
+    crossed = len(found.tables.crossed)
+    yield "lines", crossed
+    yield "rolling_s", (lines["t_end_s"] - lines["t_start_s"]).sum()
+    yield from _sizes(found, crossed)
+    recognition = found.recognition
+    name, posterior = recognition.ranking[0]
+    yield from {
+        "recognised_name": name,
+        "recognised_posterior": posterior,
+        "recognised_twins": TWINS.join(recognition.twins_of(name)),
+        "recognised_unknown": recognition.unknown[-1] if recognition.unknown.size else None,
+        "recognised_right": found.shape.name in recognition.answer,
+    }.items()
+    yield from _judged(summarise(found, to_result(found)))
+    if found.filmed is not None:
+        yield from _filmed(found.filmed)
+    yield from _health(found)
+    yield from _provenance(found)
 
 
-def analyse(folders: Sequence[Path], *, workers: int, progress: Progress | None = None) -> pd.DataFrame:
-    """Analyse sessions on ``workers`` processes; one row each, in the order given."""
-    rows: dict[Path, dict[str, Any]] = {}
-    if workers == 1 or len(folders) == 1:
-        for done, folder in enumerate(folders, start=1):
-            rows[folder] = row_of(folder)
-            if progress is not None:
-                progress(done, len(folders))
-    else:
-        # spawn, not fork: the parent may hold threads
-        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-            pending = {pool.submit(row_of, folder): folder for folder in folders}
-            for done, future in enumerate(as_completed(pending), start=1):
-                rows[pending[future]] = future.result()
-                if progress is not None:
-                    progress(done, len(folders))
-    return pd.DataFrame([rows[folder] for folder in folders])
+def _sizes(found: Reviewed, crossed: int) -> Iterator[tuple[str, Any]]:
+    truth = np.array([found.shape.area_cm2, found.shape.perimeter_cm])
+    yield from _sides("truth_{side}_{unit}", truth)
+    seen = {"robot": found.robot, "camera": found.filmed.estimate if found.filmed is not None else None}
+    for who, estimate in seen.items():
+        if estimate is not None:
+            yield from _sides(f"{who}_{{side}}_{{unit}}", _pair(estimate))
+            yield from _sides(f"{who}_sigma_{{side}}_{{unit}}", np.sqrt(np.diag(estimate.covariance)))
+            yield f"{who}_correlation", estimate.correlation
+            of_whom = "" if who == "robot" else f"{who}_"
+            yield from _sides(f"{of_whom}{{side}}_error_rel", _pair(estimate) / truth - 1)
+    if crossed == 0:
+        return
+    exact = np.sqrt(np.diag(found.moments[found.shape.name].covariance_at(crossed)))
+    yield from _sides("exact_sigma_{side}_{unit}", exact)
+    runs = max(3, min(_SIMULATED_RUNS, _SIMULATED_LINES // crossed))
+    rng = np.random.default_rng([found.settings.seed, crossed])
+    simulated = simulate(found.shape.geometry, lines=crossed, runs=runs, rng=rng)
+    yield from _sides("simulated_sigma_{side}_{unit}", np.sqrt(np.diag(simulated.covariance)))
+    if found.robot is not None:
+        off = _pair(found.robot) - truth
+        own = np.sqrt(np.diag(found.robot.covariance))
+        yield from _sides("{side}_z", np.divide(off, own, out=np.full(2, np.nan), where=own > 0))
+        yield from _sides("{side}_z_exact", off / exact)
 
 
-def _is_right(row: pd.Series[Any]) -> bool:
-    """Whether a session's answer is its shape; a twin's name, which no lines tell apart, is as good."""
-    named = {row["recognised_name"], *str(row.get("recognised_twins", "")).split(_TWINS)}
-    unknown = row.get("recognised_unknown")
-    return row["shape"] in named and not (unknown is not None and unknown > 0.5)
+def _pair(estimate: Estimate) -> np.ndarray[Any, np.dtype[np.float64]]:
+    return np.array([estimate.area_cm2, estimate.perimeter_cm])
 
 
-def per_shape(table: pd.DataFrame) -> pd.DataFrame:
-    """Per shape: sessions, share recognised, mean relative error of A and P and their spread in standard errors."""
-    if "shape" not in table.columns:
-        return pd.DataFrame()
-    whole = table[table["error"] == ""]
-    frame = pd.DataFrame(
-        {
-            "shape": whole["shape"],
-            "right": [_is_right(row) for _, row in whole.iterrows()],
-            "area_error": whole["robot_area_cm2"] / whole["truth_area_cm2"] - 1,
-            "perimeter_error": whole["robot_perimeter_cm"] / whole["truth_perimeter_cm"] - 1,
-            "area_z": (whole["robot_area_cm2"] - whole["truth_area_cm2"]) / whole["robot_sigma_area_cm2"],
-            "perimeter_z": (whole["robot_perimeter_cm"] - whole["truth_perimeter_cm"])
-            / whole["robot_sigma_perimeter_cm"],
-        }
-    )
-    means = frame.groupby("shape").mean(numeric_only=False)
-    means.insert(0, "sessions", frame.groupby("shape").size())
-    return means.reset_index()
+def _sides(name: str, values: np.ndarray[Any, np.dtype[np.float64]]) -> Iterator[tuple[str, float]]:
+    for (side, unit), value in zip(SIDES, values, strict=True):
+        yield name.format(side=side, unit=unit), float(value)
+
+
+def _judged(summary: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """What a review says beyond the sizes; a section that a session has no figures for is None."""
+    isotropy, lengths, curve = summary["isotropy"], summary["run_lengths"], summary["montecarlo"]
+    if isotropy is not None:
+        yield from {"isotropy_p_value": isotropy["p_value"], "isotropy_bias": isotropy["bias"]}.items()
+        yield "homogeneity_p_value", summary["homogeneity"]["p_value"]
+        if isotropy["shape_bias"] is not None:
+            for side, _ in SIDES:
+                yield f"isotropy_{side}_rel", isotropy["shape_bias"][f"{side}_rel"]
+    if lengths is not None:
+        yield from {"run_length_mean_cm": lengths["mean_cm"], "run_length_p_value": lengths["p_value"]}.items()
+    if curve is not None:
+        yield from {"montecarlo_p_value": curve["band_p_value"], "montecarlo_inside": curve["inside"]}.items()
+    budget = summary["budget"]
+    if budget is not None:
+        for side, _ in SIDES:
+            for term in budget[side]:
+                yield f"budget_{side}_{term['term']}_percent", term["percent"]
+        yield "budget_closes", budget["closes"]
+    yield "verdict", summary["verdict"]
+
+
+def _filmed(filmed: Filmed) -> Iterator[tuple[str, Any]]:
+    match, health = filmed.match, filmed.health
+    for name in ("matched", "missed", "extra", "bias_cm", "sd_cm", "scale"):
+        yield f"chords_{name}", getattr(match, name)
+    for name, side in (("entering", match.entering), ("leaving", match.leaving)):
+        yield from {f"latency_{name}_s": side.mean_s, f"latency_{name}_sigma_s": side.sigma_s}.items()
+    yield "latency_jitter_s", match.jitter_s
+    yield from {"filter_honest": health.honest, "filter_mean_nis": health.mean_nis}.items()
+    if filmed.straightness is not None:
+        yield from {"straight": not filmed.straightness.significant, "bend_cm": filmed.straightness.bend_cm}.items()
+
+
+def _health(found: Reviewed) -> Iterator[tuple[str, Any]]:
+    ended = found.tables.lines["ended"]
+    films: list[Mapping[str, Any]] = []
+    losses = 0
+    for event in found.session.events():
+        losses += event["event"] == "lost"
+        if event["event"] == "line" and event.get("video"):
+            films.append(event["video"])
+    yield from {
+        "end_state": _section(found.session.manifest, "end").get("state", "cut"),
+        "runs_given_up": ended.isin(["stall", "timeout"]).sum(),
+        "link_losses": losses,
+        "parts": 1 + len(found.session.manifest.get("parts") or ()),
+    }.items()
+    if films:
+        for column, name in (("frames", "frames"), ("frames_dropped", "dropped"), ("frames_late", "late")):
+            yield column, sum(int(film.get(name) or 0) for film in films)
+
+
+def _provenance(found: Reviewed) -> Iterator[tuple[str, Any]]:
+    manifest = found.session.manifest
+    devices = _section(manifest, "devices")
+    robots: list[Mapping[str, Any]] = devices.get("robots") or [_section(devices, "robot")]
+    settings = {name: value for name, value in _section(manifest, "settings").items() if name != "seed"}
+    yield from {
+        "started": manifest.get("started"),
+        "seed": str(found.settings.seed),  # may be larger than any integer of a table
+        "virtual": bool(manifest.get("virtual")),
+        "robots": ", ".join(str(robot.get("name")) for robot in robots),
+        "firmware": ", ".join(dict.fromkeys(str(robot.get("firmware")) for robot in robots)),
+        "schema_version": found.session.schema_version,
+        "chordlab_version": _section(manifest, "versions").get("chordlab"),
+        "settings_digest": hashlib.sha256(to_json(settings).encode()).hexdigest(),
+    }.items()
+
+
+def _section(record: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    return record.get(name) or {}
+
+
+def _plain(value: Any) -> Any:
+    """A value as JSON has it; numbers that are not finite as None."""
+    plain = cast("Any", value).item() if isinstance(value, np.generic) else value
+    return None if isinstance(plain, float) and not math.isfinite(plain) else plain

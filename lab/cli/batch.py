@@ -2,57 +2,135 @@
 
 from __future__ import annotations
 
+import signal
+import threading
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
+import pandas as pd
 import typer
 
-from analysis.montecarlo import available_cores
-from lab.batch import analyse, per_shape, sessions_below
-from lab.cli.output import JsonFlag, emit, progress_bar, say, show_table
+from analysis.report.sheet import write_sheet
+from lab.base.errors import ChordlabError, RequestError
+from lab.base.files import write_aside
+from lab.batch.analyse import Analysed, analyse
+from lab.batch.cache import RowCache
+from lab.batch.places import places_below
+from lab.batch.shapes import per_shape
+from lab.cli.choosing import SchedulerOption, WorkersOption
+from lab.cli.output import JsonFlag, complain, emit, progress_bar, say, show_table
 
 
 def batch(
     roots: Annotated[list[Path], typer.Argument(metavar="ROOT...", help="Folders that hold sessions.")],
-    out: Annotated[Path, typer.Option(help="Where batch.parquet and batch.csv go.")] = Path("batch"),
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: one for each core.")] = None,
+    out: Annotated[Path, typer.Option("--out", help="Folder for the tables and the report.")] = Path("batch"),
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    again: Annotated[bool, typer.Option("--again", help="Analyse anew what is known, too.")] = False,
+    no_cache: Annotated[bool, typer.Option("--no-cache", help="Neither use nor keep what is known.")] = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Analyse every session below ROOT: one table, one row a session; a broken one is a row with its reason.
 
+    Nothing is written in the sessions. What is known from the last time is not worked out again.
+
     Example: chordlab batch sessions --out batch
     """
-    folders = sessions_below(roots)
-    with progress_bar("sessions", quiet=as_json) as update:
-        table = analyse(folders, workers=workers or available_cores(), progress=update)
-    out.mkdir(parents=True, exist_ok=True)
-    table.to_parquet(out / "batch.parquet", index=False)
-    table.to_csv(out / "batch.csv", index=False)
-    summary = per_shape(table)
-    broken = table[table["error"] != ""]
+    places = places_below(roots)
+    _make(out)
+    with progress_bar("sessions", quiet=as_json) as update, _terminated_as_interrupted():
+        found = analyse(
+            places,
+            cache=None if no_cache else RowCache(out / "cache"),
+            again=again,
+            workers=workers,
+            scheduler=scheduler,
+            progress=update,
+        )
+    shapes = per_shape(found.table)
+    files = _write(found.table, shapes, out)
+    broken = found.table[found.table["error"] != ""]
     if as_json:
         emit(
             {
-                "sessions": len(table),
+                "sessions": len(found.table),
+                "asked": len(places),
+                "computed": found.computed,
                 "broken": broken[["session", "error"]].to_dict(orient="records"),
-                "shapes": summary.to_dict(orient="records"),
-                "table": out / "batch.parquet",
+                "shapes": shapes.to_dict(orient="records"),
+                **files,
             }
         )
     else:
-        rows = [
-            (
-                str(row["shape"]),
-                str(row["sessions"]),
-                f"{row['right']:.0%}",
-                f"{row['area_error']:+.1%} ({row['area_z']:+.1f} σ)",
-                f"{row['perimeter_error']:+.1%} ({row['perimeter_z']:+.1f} σ)",
-            )
-            for _, row in summary.iterrows()
-        ]
-        show_table("Sessions by shape", ("shape", "sessions", "right", "A error", "P error"), rows)
-        for _, row in broken.iterrows():
-            say(f"{row['session']}: {row['error']}")
-        say(str(out / "batch.parquet"))
-    if len(broken) == len(table):
+        _tell(found, shapes, broken, files)
+    if isinstance(found.stopped, ChordlabError):
+        raise found.stopped
+    if found.stopped is not None:
+        complain(f"stopped after {len(found.table)} of {len(places)} sessions; the same command goes on from there")
+    if found.stopped is not None or len(broken) == len(found.table):
         raise typer.Exit(1)
+
+
+def _make(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RequestError(f"{out}: {error.strerror}; choose another --out") from error
+
+
+def _write(table: pd.DataFrame, shapes: pd.DataFrame, out: Path) -> dict[str, Path]:
+    files = {"table": out / "batch.parquet", "csv": out / "batch.csv", "shapes_csv": out / "shapes.csv"}
+    try:
+        write_aside(files["table"], table.to_parquet(index=False))
+        write_aside(files["csv"], table.to_csv(index=False).encode())
+        write_aside(files["shapes_csv"], shapes.to_csv(index=False).encode())
+    except OSError as error:
+        raise RequestError(f"{out}: cannot be written ({error.strerror or error}); choose another --out") from error
+    return files | {"report": write_sheet(table, shapes, out / "report.html")}
+
+
+def _tell(found: Analysed, shapes: pd.DataFrame, broken: pd.DataFrame, files: dict[str, Path]) -> None:
+    def side(row: pd.Series[Any], name: str) -> str:
+        error, sigma = row[f"{name}_error_rel"], row[f"{name}_error_sigma_rel"]
+        return f"{error:+.1%}" if pd.isna(sigma) else f"{error:+.1%} ± {sigma:.1%}"
+
+    def spread(row: pd.Series[Any], name: str) -> str:
+        sd = row[f"{name}_z_sd"]
+        return "–" if pd.isna(sd) else f"{sd:.2f}"
+
+    rows = [
+        (
+            str(row["shape"]),
+            str(row["sessions"]),
+            f"{row['right_share']:.0%}",
+            side(row, "area"),
+            spread(row, "area"),
+            side(row, "perimeter"),
+            spread(row, "perimeter"),
+        )
+        for _, row in shapes.iterrows()
+    ]
+    show_table("Sessions by shape", ("shape", "sessions", "right", "A error", "sd z", "P error", "sd z"), rows)
+    for _, row in broken.iterrows():
+        say(f"{row['session']}: {row['error']}")
+    say(f"{len(found.table)} sessions, {found.computed} of them analysed now")
+    say(str(files["report"]))
+
+
+@contextmanager
+def _terminated_as_interrupted() -> Generator[None]:
+    """Take a request to end (SIGTERM) as Ctrl-C: what is done is kept."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(_number: int, _frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

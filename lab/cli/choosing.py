@@ -1,4 +1,4 @@
-"""How the commands take shapes from the command line, and leave files."""
+"""How the commands take shapes and workers from the command line, and leave files."""
 
 from __future__ import annotations
 
@@ -25,6 +25,12 @@ ShapeArguments = Annotated[
 ]
 FontOption = Annotated[Path | None, typer.Option("--font", help="Font file for text:WORD.")]
 CollectionOption = Annotated[str | None, typer.Option("--collection", help=f"One of {', '.join(COLLECTIONS)}.")]
+WorkersOption = Annotated[
+    int | None, typer.Option("--workers", min=0, help="Processes that share the work; 0: this one alone.")
+]
+SchedulerOption = Annotated[
+    str | None, typer.Option("--scheduler", metavar="ADDRESS", help="tcp://HOST:PORT of a Dask cluster that does it.")
+]
 
 
 def chosen_shapes(specs: Sequence[str] | None, collection: str | None, font: Path | None) -> list[Shape]:

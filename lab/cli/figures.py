@@ -9,12 +9,13 @@ import typer
 
 from analysis.figures.paper.panel import chosen_panels
 from lab.base.errors import RequestError
-from lab.batch import sessions_below
-from lab.cli.choosing import FontOption
+from lab.batch.places import sessions_below
+from lab.cli.choosing import FontOption, SchedulerOption, WorkersOption
 from lab.cli.output import JsonFlag, complain, emit, progress_bar, say
 from lab.figures.draw import SHEET, as_found, draw_figures
 from lab.figures.robots import NO_SESSIONS, stored_robots
 from lab.figures.workbench import Scale
+from lab.spread.spread import spreading
 from projector.dictionary import load_dictionary
 from projector.text import find_font
 
@@ -33,6 +34,8 @@ def figures(
     lines: Annotated[int, typer.Option("--lines", min=20, max=100_000, help="Crossing lines of a robot.")] = 1000,
     blinks: Annotated[str, typer.Option("--blinks", help="Numbers of lines N of 1B's maps.")] = "10,40,100,200,1000",
     font: FontOption = None,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Draw the paper's figures: each panel as SVG and PNG, the data behind it as CSV, and a page with captions.
@@ -47,7 +50,10 @@ def figures(
         if sessions is not None and FROM_SESSIONS & set(names):
             film = bool(FILMED & set(names))
             stored = stored_robots(sessions_below([sessions]), load_dictionary(), film=film)
-        drawn = draw_figures(names, out, seed=seed, scale=scale, font=typeface, stored=stored, progress=update)
+        mapper = spreading(workers, scheduler)
+        drawn = draw_figures(
+            names, out, seed=seed, scale=scale, font=typeface, stored=stored, progress=update, mapper=mapper
+        )
     for session, reason in drawn.left_out:
         complain(f"{session} is left out: {reason}")
     if as_json:

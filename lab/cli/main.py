@@ -16,16 +16,19 @@ from lab.cli import (
     characterise,
     classes,
     doctor,
+    export,
     figures,
     geometry,
     plan,
     project,
     recognize,
+    recover,
     robot,
     run,
     shapes,
     track,
     validate,
+    watch,
 )
 from lab.cli.output import complain
 
@@ -37,8 +40,10 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 app.command("run")(run.run)
+app.command("watch")(watch.watch)
 app.command("validate")(validate.validate)
 app.command("recognize")(recognize.recognize)
+app.command("recover")(recover.recover)
 app.command("finalize")(validate.finalize)
 app.command("batch")(batch.batch)
 app.command("figures")(figures.figures)
@@ -48,6 +53,7 @@ app.command("track")(track.track)
 app.command("moments")(geometry.moments)
 app.command("simulate")(geometry.simulate)
 app.command("project")(project.project)
+app.command("export")(export.export)
 app.command("doctor")(doctor.doctor)
 app.add_typer(shapes.app, name="shapes")
 app.add_typer(robot.app, name="robot")

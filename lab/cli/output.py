@@ -29,12 +29,17 @@ def complain(text: str) -> None:
 
 def show_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """A small table on stdout; first column left, the rest right."""
-    table = Table(title=title, title_justify="left", header_style="bold")
+    table = Table(title=title, title_justify="left", header_style="bold", show_header=any(columns))
     for number, column in enumerate(columns):
         table.add_column(column, justify="left" if number == 0 else "right", overflow="fold")
     for row in rows:
         table.add_row(*row)
     Console(highlight=False).print(table)
+
+
+def lines_needed(lines: int | None) -> str:
+    """The lines that something takes, as a table says it."""
+    return "never" if lines is None else str(lines)
 
 
 def emit(data: Mapping[str, Any]) -> None:

@@ -13,7 +13,7 @@ from analysis.figures.separability import separability_figure
 from analysis.figures.style import save_figure
 from analysis.figures.values import Entry
 from lab.cli.choosing import CollectionOption, FontOption, ShapeArguments, chosen_shapes, leaving, picture_path
-from lab.cli.output import JsonFlag, emit, progress_bar, say, show_table
+from lab.cli.output import JsonFlag, emit, lines_needed, progress_bar, say, show_table
 from lab.recognisers import sensor_model
 from lab.separability import PairProspects, Prospect, Separability, separability
 from lab.settings import Settings
@@ -100,22 +100,18 @@ def _show_separability(found: Separability) -> None:
 
 
 def _prospect_cells(prospect: Prospect) -> tuple[str, str, str]:
-    return f"{100 * prospect.right:.1f} %", _count(prospect.lines), prospect.rival or "-"
+    return f"{100 * prospect.right:.1f} %", lines_needed(prospect.lines), prospect.rival or "-"
 
 
 def _pair_cells(pair: PairProspects) -> tuple[str, ...]:
     return (
         " / ".join(pair.names),
         _percent(pair.plane_error),
-        _count(pair.plane_lines),
+        lines_needed(pair.plane_lines),
         _percent(pair.line_error),
-        _count(pair.line_lines),
+        lines_needed(pair.line_lines),
     )
 
 
 def _percent(share: float) -> str:
     return f"{100 * share:.2g} %" if share > 1e-4 else "< 0.01 %"  # the models say nothing of such tails
-
-
-def _count(lines: int | None) -> str:
-    return "never" if lines is None else str(lines)

@@ -17,6 +17,7 @@ from lab.cli.choosing import (
     leaving,
     picture_path,
 )
+from lab.cli.learn import learn
 from lab.cli.output import JsonFlag, emit, say, show_table
 from lab.cli.reading import show_reading
 from lab.cli.separability import show_separability
@@ -150,6 +151,7 @@ def import_file(
 
 app.command("separability")(show_separability)
 app.command("reading")(show_reading)
+app.command("learn")(learn)
 
 
 def _figures(shape: Shape) -> dict[str, object]:

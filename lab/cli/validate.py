@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,10 +10,14 @@ import typer
 
 from analysis.figures.budget import name_of
 from analysis.report.words import signed, signed_with
+from lab.base.errors import RequestError
 from lab.cli.output import JsonFlag, emit, progress_bar, say, show_table
-from lab.finalize import finalize as rebuild
+from lab.reread import Thresholds, figures_of, reread
 from lab.review import review
-from lab.store import write_checksums
+from lab.store.reader import SessionReader
+from lab.store.seal import write_checksums
+from lab.store.tables import Tables, tables_of, write_table
+from lab.store.tables import finalize as rebuild
 
 FolderArgument = Annotated[Path, typer.Argument(metavar="DIR", help="A session folder.")]
 
@@ -78,11 +83,25 @@ def _percent(term: dict[str, Any]) -> str:
     return signed_with(term["percent"], term["sigma_percent"])
 
 
-def finalize(folder: FolderArgument, as_json: JsonFlag = False) -> None:
-    """Rebuild a session's tables from its log.
+def finalize(
+    folder: FolderArgument,
+    from_light: Annotated[
+        bool, typer.Option("--from-light", help="From the raw light samples, with these thresholds; see --out.")
+    ] = False,
+    low: Annotated[float | None, typer.Option(help="Confirms the dark: a share of the span, below 0.5.")] = None,
+    high: Annotated[float | None, typer.Option(help="Confirms the light: a share of the span, above 0.5.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Where the tables from the light go.")] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Rebuild a session's tables from its log, or read its raw light again with other thresholds.
 
-    Example: chordlab finalize sessions/2026-11-23T1042_eiffel_ab12
+    Example: chordlab finalize sessions/2026-11-23T1042_eiffel_ab12 --from-light --low 0.35 --high 0.65 --out reread
     """
+    if from_light:
+        _from_light(folder, low, high, out, as_json=as_json)
+        return
+    if (low, high, out) != (None, None, None):
+        raise RequestError("--low, --high and --out are for the raw light: give --from-light too")
     tables = rebuild(folder)
     write_checksums(folder)
     counts = {"lines": len(tables.lines), "crossings": len(tables.crossings), "estimates": len(tables.estimates)}
@@ -90,6 +109,52 @@ def finalize(folder: FolderArgument, as_json: JsonFlag = False) -> None:
         emit({"folder": folder, **counts})
     else:
         say(", ".join(f"{count} {name}" for name, count in counts.items()))
+
+
+def _from_light(folder: Path, low: float | None, high: float | None, out: Path | None, *, as_json: bool) -> None:
+    """Tables from the raw light, beside those of the log, which is the truth and is left alone."""
+    if (low is None) != (high is None):
+        raise RequestError("thresholds come in pairs: give both --low and --high, or neither")
+    if out is not None and out.resolve().is_relative_to(folder.resolve()):
+        raise RequestError(f"{out}: lies in the session, which holds what its log says; choose another --out")
+    thresholds = None if low is None or high is None else Thresholds(low, high)
+    with progress_bar("reading the light again", quiet=as_json) as update:
+        again = reread(folder, thresholds=thresholds, progress=update)
+    logged, found = (figures_of(tables) for tables in (tables_of(SessionReader(folder)), again))
+    if out is not None:
+        _keep(again, out)
+    if as_json:
+        emit({"folder": folder, "out": out, "log": logged, "light": found})
+        return
+    names = {"area_cm2": "A, cm²", "perimeter_cm": "P, cm", "crossings": "crossings", "lines": "crossing lines"}
+    rows = [
+        (text, _plain(logged[name]), _plain(found[name]), _change(logged, found, name)) for name, text in names.items()
+    ]
+    show_table(f"{folder.name}: the light read again", ("", "log", "light", "change"), rows)
+    if out is not None:
+        say(str(out))
+
+
+def _keep(tables: Tables, out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for name in Tables.__slots__:
+            write_table(out, name, getattr(tables, name))
+    except OSError as error:
+        raise RequestError(f"{out}: {error.strerror or error}; choose another --out") from error
+
+
+def _plain(figure: float | None) -> str:
+    return "–" if figure is None else f"{figure:.1f}" if isinstance(figure, float) else str(figure)
+
+
+def _change(logged: Mapping[str, float | None], found: Mapping[str, float | None], name: str) -> str:
+    before, after = logged[name], found[name]
+    if before is None or after is None:
+        return "–"
+    if isinstance(before, float):
+        return f"{100 * (after / before - 1):+.2f} %" if before else "–"
+    return f"{after - before:+d}"
 
 
 def _with_error(figures: dict[str, Any], name: str) -> str:

@@ -12,6 +12,7 @@ from analysis.figures.paper.panel import PANELS, PaperPanel, write_panel
 from analysis.figures.paper.plane import crowd_panel, domains_panel, letters_panel, needed_panel, window_of, words_panel
 from analysis.figures.paper.precision import complexity_panel, scatter_panel
 from analysis.figures.paper.word import global_panel, letters_plane_panel, local_panel, whole_plane_panel
+from analysis.tablestore import Mapper
 from lab.base.errors import ChordlabError, RequestError
 from lab.base.files import write_aside
 from lab.figures.robots import NO_SESSIONS, Stored
@@ -154,11 +155,12 @@ def draw_figures(
     font: Font | None = None,
     stored: Stored = NO_SESSIONS,
     progress: Progress = lambda _done, _total: None,
+    mapper: Mapper | None = None,
 ) -> Drawn:
     """Draw the panels ``names`` (`analysis.figures.paper.panel.chosen_panels`) and a contact sheet into ``out``.
 
     The same seed, scale and sessions give the same tables, whichever panels are asked for. ``progress`` is called with
-    (spent, in all), in tenths of a second or so.
+    (spent, in all), in tenths of a second or so. ``mapper`` spreads the work and does not change it: see `Workbench`.
 
     Raises:
         RequestError: ``out`` cannot be written.
@@ -172,7 +174,15 @@ def draw_figures(
         done += cost
         progress(min(round(done), total), total)
 
-    bench = Workbench(settings or Settings(), seed=seed, scale=scale or Scale(), font=font, stored=stored, spent=spent)
+    bench = Workbench(
+        settings or Settings(),
+        seed=seed,
+        scale=scale or Scale(),
+        font=font,
+        stored=stored,
+        spent=spent,
+        mapper=mapper,
+    )
     panels: list[PaperPanel] = []
     files: list[Path] = []
     try:

@@ -21,10 +21,13 @@ from analysis.estimate import running_estimates
 from analysis.figures.paper.explored import Explored
 from analysis.montecarlo import Lines
 from lab.base.errors import ChordlabError, RequestError
-from lab.finalize import Tables, tables_of
-from lab.review import SHORTEST_RUN_CM, examine, stored_settings, stored_shape
+from lab.filmed import SHORTEST_RUN_CM
+from lab.review import examine, keep
 from lab.settings import Settings
-from lab.store import SessionReader
+from lab.store.lock import is_being_written
+from lab.store.reader import SessionReader
+from lab.store.tables import Tables, tables_of
+from lab.stored import stored_settings, stored_shape
 from projector.shape import Shape
 from tracking.isotropy import TooFewLinesError, examine_lines
 
@@ -33,7 +36,6 @@ Ints = NDArray[np.int64]
 
 _SIMULATED = "a simulated robot"
 _TRACK = ("line", "x_cm", "y_cm", "led_on")
-_LOCK = "writer.lock"
 _FEWEST_LINES = 10  # a session with fewer replaces nothing
 
 
@@ -190,9 +192,9 @@ def _explored(session: SessionReader, shape: Shape, tables: Tables, *, film: boo
     track: pd.DataFrame | None = None
     tracked = (session.folder / "track.parquet").is_file()
     # a folder that another process may be writing to is left as it is: it serves, but not for what a camera saw
-    if film and session.segments() and (tracked or not (session.folder / _LOCK).exists()):
+    if film and session.segments() and (tracked or not is_being_written(session.folder)):
         if not tracked:
-            examine(session.folder)
+            keep(examine(session.folder))
         track = session.table("track")
         if not set(_TRACK) <= set(track.columns):
             raise RequestError(f"{session.folder}: its track is of an older chordlab; run chordlab validate on it")

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +19,11 @@ from analysis.figures.paper.known import Known
 from analysis.figures.paper.plane import GRID
 from analysis.figures.paper.precision import Complexity
 from analysis.figures.paper.word import Read
-from analysis.montecarlo import Bands, running_bands, simulate, simulate_chords
+from analysis.montecarlo import Bands, Simulation, running_bands, simulate, simulate_chords
 from analysis.quadrature import Moments, exact_moments
 from analysis.reading import Strategies, compare_strategies, lines_in_a_dictionary_of
 from analysis.scaling import PowerLaw, fit_scatter
+from analysis.tablestore import Mapper
 from lab.figures.robots import NO_SESSIONS, Stored, simulated_robot
 from lab.separability import separability
 from lab.settings import Settings
@@ -31,6 +33,8 @@ from projector.text import TEXT_PREFIX, Typeface, find_font
 
 Floats = NDArray[np.float64]
 Progress = Callable[[int, int], None]
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
 
 WORD = "FREEDOM"
 ELLIPSES_AT = 1000  # lines, Fig. 1G
@@ -93,6 +97,8 @@ class Workbench:
         font: for letters and words, as for `projector.text.find_font`.
         stored: sessions that replace simulated robots.
         spent: called with the cost of each product as it is made.
+        mapper: spreads what is worked out for each shape over processes or a cluster; default: one after the other,
+            with threads. It does not change what is found.
     """
 
     def __init__(
@@ -104,12 +110,23 @@ class Workbench:
         font: Font | None = None,
         stored: Stored = NO_SESSIONS,
         spent: Callable[[float], None] = lambda _cost: None,
+        mapper: Mapper | None = None,
     ) -> None:
         self.settings, self.scale, self.stored = settings, scale, stored
-        self._seed, self._font, self._spent = seed, font, spent
+        self._seed, self._font, self._spent, self._mapper = seed, font, spent, mapper or one_by_one
 
     def _rng(self, purpose: str) -> np.random.Generator:
-        return np.random.default_rng([self._seed, zlib.crc32(purpose.encode())])
+        return stream_of(self._seed, purpose)
+
+    def _each(
+        self, product: str, task: Callable[[tuple[str, _Item]], _Result], items: Mapping[str, _Item]
+    ) -> dict[str, _Result]:
+        """What a task finds for each item, (name, item), of a product."""
+        found: dict[str, _Result] = {}
+        for (name, _), result in self._mapper(task, list(items.items())):
+            found[name] = result
+            self._step(product, len(items))
+        return {name: found[name] for name in items}
 
     def _step(self, product: str, parts: int = 1) -> None:
         self._spent(COSTS[product] / parts)
@@ -132,11 +149,11 @@ class Workbench:
     @cached_property
     def exact(self) -> dict[str, Moments]:
         """Exact moments of the six."""
-        found: dict[str, Moments] = {}
-        for name, shape in self.shapes.items():
-            found[name] = exact_moments(shape.geometry)
-            self._step("exact", len(self.shapes))
-        return found
+        return self._each("exact", exact_of, self._geometries)
+
+    @cached_property
+    def _geometries(self) -> dict[str, Silhouette]:
+        return {name: shape.geometry for name, shape in self.shapes.items()}
 
     @cached_property
     def robots(self) -> dict[str, Explored]:
@@ -150,33 +167,23 @@ class Workbench:
 
     @cached_property
     def _simulated_robots(self) -> dict[str, Explored]:
-        found: dict[str, Explored] = {}
-        for name, shape in self.shapes.items():
-            robot = simulated_robot(shape, self.settings, lines=self.scale.lines, rng=self._rng(f"robot {name}"))
-            found[name] = replace(robot, title=self.titles[name])
-            self._step("robots", len(self.shapes))
-        return found
+        explore = partial(robot_of, settings=self.settings, lines=self.scale.lines, seed=self._seed)
+        found = self._each("robots", explore, self.shapes)
+        return {name: replace(robot, title=self.titles[name]) for name, robot in found.items()}
 
     @cached_property
     def simulated(self) -> dict[str, Bands]:
         """Simulated runs over the six."""
         n = np.geomspace(2, self.scale.most_lines, 38).round().astype(np.int64)
         checkpoints = np.unique(np.append(n, ELLIPSES_AT))
-        found: dict[str, Bands] = {}
-        for name, shape in self.shapes.items():
-            found[name] = running_bands(shape.geometry, checkpoints, self.scale.runs, self._rng(f"runs {name}"))
-            self._step("simulated", len(self.shapes))
-        return found
+        follow = partial(bands_of, checkpoints=checkpoints, runs=self.scale.runs, seed=self._seed)
+        return self._each("simulated", follow, self._geometries)
 
     @cached_property
     def fits(self) -> dict[str, dict[str, PowerLaw]]:
         """Power laws through the scatter: of "area_cm2" and "perimeter_cm", for each shape."""
-        found: dict[str, dict[str, PowerLaw]] = {"area_cm2": {}, "perimeter_cm": {}}
-        for name, bands in self.simulated.items():
-            for column, runs in (("area_cm2", bands.area_runs_cm2), ("perimeter_cm", bands.perimeter_runs_cm)):
-                found[column][name] = fit_scatter(bands.n, runs, self._rng(f"fit {column} {name}"))
-            self._step("fits", len(self.simulated))
-        return found
+        found = self._each("fits", partial(laws_of, seed=self._seed), self.simulated)
+        return {column: {name: laws[column] for name, laws in found.items()} for column in ("area_cm2", "perimeter_cm")}
 
     @cached_property
     def complexity(self) -> dict[str, Complexity]:
@@ -232,12 +239,9 @@ class Workbench:
     def words(self) -> Known:
         """The words of the preamble as a dictionary, by (P, A)."""
         shapes = load_dictionary("words", font=self.font)
-        classes = congruence_classes({name: shape.geometry for name, shape in shapes.items()})
-        moments: dict[str, Moments] = {}
-        for name, shape in shapes.items():
-            moments[name] = _moments_of(shape.geometry)
-            self._step("words", len(shapes))
-        return Known.of(_bare(shapes), moments, classes)
+        geometries = {name: shape.geometry for name, shape in shapes.items()}
+        moments = self._each("words", coarse_of, geometries)
+        return Known.of(_bare(shapes), moments, congruence_classes(geometries))
 
     @cached_property
     def _word(self) -> tuple[Silhouette, float]:
@@ -254,10 +258,7 @@ class Workbench:
         """The capitals at the size that letters have in the word."""
         typeface, height_cm = Typeface(self.font), self._word[1]
         letters = {f"{TEXT_PREFIX}{letter}": typeface.set(letter, cap_height_cm=height_cm) for letter in _CAPITALS}
-        moments: dict[str, Moments] = {}
-        for name, geometry in letters.items():
-            moments[name] = exact_moments(geometry, tolerance=_TOLERANCE)
-            self._step("alphabet", len(letters))
+        moments = self._each("alphabet", partial(exact_of, tolerance=_TOLERANCE), letters)
         titles = {name: name.removeprefix(TEXT_PREFIX) for name in letters}
         return Known.of(titles, moments, congruence_classes(letters))
 
@@ -268,20 +269,19 @@ class Workbench:
         typeface, lines = Typeface(self.font), self.scale.read_lines
         n = np.unique(np.geomspace(min(100, lines / 10), lines, 40).round().astype(np.int64))
         share, runs = lines // len(WORD), max(3, round(self.scale.read_runs * self.scale.runs))
-        letters = [typeface.set(letter, cap_height_cm=height_cm) for letter in WORD]
-        found = [
-            simulate(letter, lines=share, runs=runs, rng=self._rng(f"letter {place} of the word"))
-            for place, letter in enumerate(letters)
-        ]
+        letters = {
+            f"letter {place} of the word": typeface.set(letter, cap_height_cm=height_cm)
+            for place, letter in enumerate(WORD)
+        }
+        found = self._each("read", partial(runs_of, lines=share, runs=runs, seed=self._seed), letters)
         bands = running_bands(_coarse(whole), n, runs, self._rng("the word"))
-        self._step("read")
         return Read(
             WORD,
             _moments_of(whole),
             [self.alphabet.moments[f"{TEXT_PREFIX}{letter}"] for letter in WORD],
             lines,
             bands,
-            np.array([np.column_stack([run.area_cm2, run.perimeter_cm]) for run in found]),
+            np.array([np.column_stack([run.area_cm2, run.perimeter_cm]) for run in found.values()]),
         )
 
     @cached_property
@@ -299,6 +299,54 @@ class Workbench:
 
 
 _CAPITALS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
+
+
+def one_by_one(task: Callable[[Any], Any], items: Sequence[Any]) -> Iterator[tuple[Any, Any]]:
+    """Work on items in this process, in their order."""
+    for item in items:
+        yield item, task(item)
+
+
+def stream_of(seed: int, purpose: str) -> np.random.Generator:
+    """The random stream of one purpose."""
+    return np.random.default_rng([seed, zlib.crc32(purpose.encode())])
+
+
+# What is worked out for each shape by itself, by whoever does it: (name, geometry) in, the product out.
+
+
+def exact_of(named: tuple[str, Silhouette], *, tolerance: float | None = None) -> Moments:
+    """Exact moments of one shape."""
+    return exact_moments(named[1]) if tolerance is None else exact_moments(named[1], tolerance=tolerance)
+
+
+def coarse_of(named: tuple[str, Silhouette]) -> Moments:
+    """Exact moments of one outline of very many vertices."""
+    return _moments_of(named[1])
+
+
+def robot_of(named: tuple[str, Shape], *, settings: Settings, lines: int, seed: int) -> Explored:
+    """A simulated robot's exploration of one shape."""
+    return simulated_robot(named[1], settings, lines=lines, rng=stream_of(seed, f"robot {named[0]}"))
+
+
+def bands_of(named: tuple[str, Silhouette], *, checkpoints: NDArray[np.int64], runs: int, seed: int) -> Bands:
+    """Simulated runs over one shape."""
+    return running_bands(named[1], checkpoints, runs, stream_of(seed, f"runs {named[0]}"))
+
+
+def runs_of(named: tuple[str, Silhouette], *, lines: int, runs: int, seed: int) -> Simulation:
+    """Simulated runs over one letter, their ends alone."""
+    return simulate(named[1], lines=lines, runs=runs, rng=stream_of(seed, named[0]))
+
+
+def laws_of(named: tuple[str, Bands], *, seed: int) -> dict[str, PowerLaw]:
+    """Power laws through the scatter of one shape's area and perimeter."""
+    name, bands = named
+    columns = {"area_cm2": bands.area_runs_cm2, "perimeter_cm": bands.perimeter_runs_cm}
+    return {
+        column: fit_scatter(bands.n, runs, stream_of(seed, f"fit {column} {name}")) for column, runs in columns.items()
+    }
 
 
 def _bare(shapes: Mapping[str, Shape]) -> dict[str, str]:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from lab.store import SessionFolderError, SessionReader
+from lab.base.files import write_aside
+from lab.store.layout import SessionFolderError
+from lab.store.lock import writing
+from lab.store.reader import SessionReader
+from lab.store.sound import check_sound
 
 LINE_COLUMNS = {
     "line": "int64",
@@ -29,8 +34,6 @@ LINE_COLUMNS = {
     "starts_lit": "bool",
     "ends_lit": "bool",
 }
-# What the lines of a log of schema 1 do not say: they were all of one robot, and whole.
-_SCHEMA_1 = {"robot": "", "weight": 1.0, "starts_lit": False, "ends_lit": False}
 CROSSING_COLUMNS = {"line": "int64", "order": "int64", "t_s": "float64", "s_cm": "float64", "entering": "bool"}
 ESTIMATE_COLUMNS = {
     "n": "int64",
@@ -59,19 +62,27 @@ class Tables:
     crossings: pd.DataFrame
     estimates: pd.DataFrame
 
+    @property
+    def crossed(self) -> pd.DataFrame:
+        """The lines of the statistics that crossed the shape."""
+        return self.lines[self.lines["counts"] & (self.lines["k"] > 0)]
+
 
 def tables_of(session: SessionReader) -> Tables:
     """Read a session's log into tables. Raises SessionFolderError naming the event that lacks a value."""
+    return tables_from(session.events(), session.folder)
+
+
+def tables_from(events: Iterable[Mapping[str, Any]], folder: Path) -> Tables:
+    """Make tables of events, those of ``folder``'s session. Raises SessionFolderError as `tables_of`."""
     lines: list[dict[str, Any]] = []
     crossings: list[dict[str, Any]] = []
     estimates: list[dict[str, Any]] = []
-    absent = _SCHEMA_1 if session.schema_version == 1 else {}
-    for event in session.events():
+    for event in events:
         if event["event"] != "line":
             continue
         try:
-            known = {**absent, "whole": event["counts"], "end_cm": event["length_cm"], **event} if absent else event
-            lines.append({name: known[name] for name in LINE_COLUMNS})
+            lines.append({name: event[name] for name in LINE_COLUMNS})
             for order, (t_s, s_cm, entering) in enumerate(event["crossings"]):
                 crossings.append(
                     {"line": event["line"], "order": order, "t_s": t_s, "s_cm": s_cm, "entering": entering}
@@ -79,26 +90,36 @@ def tables_of(session: SessionReader) -> Tables:
             if "estimate" in event:
                 estimates.append({"line": event["line"], "t_s": event["t_end_s"], **event["estimate"]})
         except (KeyError, TypeError, ValueError) as error:
-            raise SessionFolderError(
-                session.folder, f"the event of line {event.get('line')} is not whole ({error})"
-            ) from error
-    return Tables(
-        _table(session, lines, LINE_COLUMNS),
-        _table(session, crossings, CROSSING_COLUMNS),
-        _table(session, estimates, ESTIMATE_COLUMNS),
+            raise SessionFolderError(folder, f"the event of line {event.get('line')} is not whole ({error})") from error
+    tables = Tables(
+        _table(folder, lines, LINE_COLUMNS),
+        _table(folder, crossings, CROSSING_COLUMNS),
+        _table(folder, estimates, ESTIMATE_COLUMNS),
     )
-
-
-def finalize(folder: Path) -> Tables:
-    """Rebuild and write the tables of a session folder."""
-    tables = tables_of(SessionReader(folder))
-    for name in Tables.__slots__:
-        getattr(tables, name).to_parquet(folder / f"{name}.parquet", index=False)
+    check_sound(folder, tables.lines, tables.crossings, tables.estimates)
     return tables
 
 
-def _table(session: SessionReader, rows: list[dict[str, Any]], columns: dict[str, str]) -> pd.DataFrame:
+def finalize(folder: Path) -> Tables:
+    """Rebuild and write the tables of a session folder.
+
+    Raises SessionFolderError: it is no session, its log is not whole, or another process writes in it.
+    """
+    session = SessionReader(folder)
+    with writing(folder):
+        tables = tables_of(session)
+        for name in Tables.__slots__:
+            write_table(folder, name, getattr(tables, name))
+    return tables
+
+
+def write_table(folder: Path, name: str, table: pd.DataFrame) -> None:
+    """Write a derived table into a session's folder, whole or not at all. Raises OSError."""
+    write_aside(folder / f"{name}.parquet", table.to_parquet(index=False))
+
+
+def _table(folder: Path, rows: list[dict[str, Any]], columns: dict[str, str]) -> pd.DataFrame:
     try:
         return pd.DataFrame(rows, columns=list(columns)).astype(columns)
-    except (TypeError, ValueError) as error:
-        raise SessionFolderError(session.folder, f"the log holds a value of the wrong kind ({error})") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise SessionFolderError(folder, f"the log holds a value of the wrong kind ({error})") from error

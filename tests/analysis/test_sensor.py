@@ -256,8 +256,8 @@ def test_what_is_not_seen_is_said(rng):
 @pytest.mark.slow
 def test_a_virtual_session_measures_what_the_sensor_model_says(tmp_path):
     """The whole virtual bench: radio, driver, projector's pixels, Lambert's turns, levels learnt in the preflight."""
-    from lab.finalize import tables_of
-    from lab.store import SessionReader
+    from lab.store.reader import SessionReader
+    from lab.store.tables import tables_of
     from projector.dictionary import shape_from
     from tests.lab.conftest import roll
 

@@ -46,3 +46,25 @@ def filmed_session(tmp_path_factory) -> Rolled:
 def uniform_session(tmp_path_factory) -> Rolled:
     """100 lines over the tower by a robot that turns by a uniform angle, as it should not; no video."""
     return roll(tmp_path_factory.mktemp("uniform"), motion__turning="uniform", stop__lines=100, seed=5)
+
+
+@pytest.fixture(scope="session")
+def alone_on_film(tmp_path_factory) -> Path:
+    """One robot's short session, filmed, with a drawn track; to be read only."""
+    from tests.lab.filmed_sessions import filmed_alone
+
+    return filmed_alone(tmp_path_factory.mktemp("alone"))
+
+
+@pytest.fixture(scope="session")
+def pair_on_film(tmp_path_factory) -> Path:
+    """The same with two robots."""
+    from tests.lab.filmed_sessions import filmed_pair
+
+    return filmed_pair(tmp_path_factory.mktemp("pair"))
+
+
+@pytest.fixture(scope="session")
+def onboard_session(tmp_path_factory) -> Path:
+    """A robot that estimated by itself."""
+    return roll(tmp_path_factory.mktemp("onboard"), shape="square", robot="onboard:virtual", stop__lines=5).folder

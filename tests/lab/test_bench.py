@@ -8,7 +8,7 @@ import pytest
 from lab.experiment import run_experiment
 from lab.rigcheck import RigError
 from lab.settings import load_settings
-from lab.store import SessionReader
+from lab.store.reader import SessionReader
 from projector.device import ProjectorError
 from projector.virtual import VirtualProjector
 from tests.lab.conftest import STARTED

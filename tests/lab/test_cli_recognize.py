@@ -1,10 +1,8 @@
 import json
 
 import numpy as np
-import pandas as pd
 import pytest
 
-from lab.batch import per_shape
 from lab.cli.main import main
 
 
@@ -86,16 +84,3 @@ def test_both_ways_to_read_a_word(told, full):
     code, _, err = told("shapes", "reading", "no")
     assert code == 2
     assert "none of the letters" in err
-
-
-def test_a_twins_name_is_right_in_a_batch_and_none_of_these_is_not():
-    figures = dict.fromkeys(
-        ["robot_area_cm2", "truth_area_cm2", "robot_perimeter_cm", "truth_perimeter_cm"], 100.0
-    ) | dict.fromkeys(["robot_sigma_area_cm2", "robot_sigma_perimeter_cm"], 5.0)
-    told = [("n", "", 0.1), ("u", "n; z", 0.1), ("u", "", 0.1), ("n", "", 0.9)]
-    rows = [
-        {"shape": "n", "error": "", "recognised_name": name, "recognised_twins": twins, "recognised_unknown": unknown}
-        | figures
-        for name, twins, unknown in told
-    ]
-    assert per_shape(pd.DataFrame(rows))["right"].tolist() == [0.5]

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from lab.cli.main import main
-from lab.finalize import tables_of
 from lab.review import review
 from lab.roller import SessionError
-from lab.store import SessionReader
+from lab.store.reader import SessionReader
+from lab.store.tables import tables_of
 from robot.errors import ReconnectError
 from robot.virtual.selfguided import VirtualSelfGuided
 from tests.lab.traces import rolled

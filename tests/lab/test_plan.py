@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from lab.cli.main import main
-from lab.finalize import tables_of
 from lab.plan import charge_s, plan
 from lab.recognisers import sensor_model
 from lab.separability import separability
 from lab.settings import Settings, load_settings
 from lab.simulated import check_against_simulation
-from lab.store import SessionReader
+from lab.store.reader import SessionReader
+from lab.store.tables import tables_of
 from projector.collections import load_dictionary
 from tests.lab.conftest import roll
 

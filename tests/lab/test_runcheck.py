@@ -9,11 +9,12 @@ import pytest
 from shapely import Point, box
 
 from analysis.report.verdict import verdict_of
-from lab.finalize import tables_of
-from lab.review import examine, review, summarise, to_result
+from lab.findings import summarise, to_result
+from lab.review import examine, review
 from lab.runcheck import check_runs
 from lab.settings import load_settings
-from lab.store import SessionReader
+from lab.store.reader import SessionReader
+from lab.store.tables import tables_of
 from tests.lab.conftest import roll
 
 REACH = box(-56.35, -41.35, 56.35, 41.35)

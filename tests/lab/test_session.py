@@ -11,10 +11,10 @@ from shapely import LineString, Point, box
 
 from lab.base.errors import ChordlabError, RequestError
 from lab.experiment import run_experiment
-from lab.finalize import finalize, tables_of
-from lab.review import recognised, review
+from lab.review import recognition_of, review
 from lab.settings import load_settings
-from lab.store import SessionReader
+from lab.store.reader import SessionReader
+from lab.store.tables import finalize, tables_of
 from robot.crossings import Levels, LevelsError, crossings_of
 from tests.lab.conftest import STARTED, roll
 
@@ -65,9 +65,9 @@ def test_mean_run_length_is_that_of_isotropic_lines(square_session):
 def test_a_session_read_again_finds_the_posteriors_of_its_log(square_session):
     session = SessionReader(square_session.folder)
     tables = tables_of(session)
-    ranking, posteriors = recognised(session, tables)
-    assert ranking[0] == (tables.estimates["leading"].iloc[-1], tables.estimates["posterior"].iloc[-1])
-    assert posteriors.drop(columns="n").max(axis=1).tolist() == tables.estimates["posterior"].tolist()
+    found = recognition_of(session, tables)
+    assert found.ranking[0] == (tables.estimates["leading"].iloc[-1], tables.estimates["posterior"].iloc[-1])
+    assert found.posteriors.drop(columns="n").max(axis=1).tolist() == tables.estimates["posterior"].tolist()
 
 
 def test_raw_light_gives_the_same_crossings_again(square_session):
@@ -192,7 +192,7 @@ def test_a_shape_too_large_for_the_arena_is_refused(tmp_path):
 
 
 def test_a_full_disk_stops_the_session_and_what_was_written_reads(tmp_path, monkeypatch):
-    from lab import store
+    from lab.store import writer as store
 
     committed = store.SessionWriter.commit_line
 

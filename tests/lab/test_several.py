@@ -9,10 +9,10 @@ import pytest
 
 from lab.base.errors import RequestError
 from lab.cli.main import main
-from lab.finalize import tables_of
 from lab.review import review
 from lab.settings import load_settings
-from lab.store import SessionReader
+from lab.store.reader import SessionReader
+from lab.store.tables import tables_of
 from lab.tally import stored_estimate
 from robot.virtual.faults import Fault
 from tests.lab.traces import area_perimeter, rolled

@@ -8,7 +8,7 @@ from shapely import Polygon
 from lab.attribution import attribute, lines_from_the_edge
 from lab.review import review
 from lab.settings import load_settings
-from lab.store import SessionReader
+from lab.store.reader import SessionReader
 from tests.lab.traces import rolled
 from tracking.video import read_frames
 

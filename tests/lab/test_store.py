@@ -7,8 +7,11 @@ import pandas as pd
 import pytest
 
 from lab.base.errors import ChordlabError
-from lab.finalize import finalize, tables_of
-from lab.store import SessionFolderError, SessionReader, SessionWriter, disk_faults, write_checksums
+from lab.store.layout import SessionFolderError
+from lab.store.reader import SessionReader
+from lab.store.seal import write_checksums
+from lab.store.tables import finalize, tables_of
+from lab.store.writer import SessionWriter, disk_faults
 
 STARTED = datetime(2026, 11, 23, 10, 42)
 
@@ -156,14 +159,14 @@ def test_a_log_of_the_first_schema_reads_as_one_robot_rolling_whole_lines(tmp_pa
         made.append("line", **{name: value for name, value in old.items() if name not in new})
     made.close()
     manifest = made.folder / "manifest.json"
-    manifest.write_text(manifest.read_text().replace('"schema_version": 2', '"schema_version": 1'))
+    manifest.write_text(manifest.read_text().replace('"schema_version": 3', '"schema_version": 1'))
     lines = finalize(made.folder).lines
     assert lines["whole"].tolist() == lines["counts"].tolist() == [False, True]
     assert lines["weight"].tolist() == [1.0, 1.0]
     assert lines["end_cm"].tolist() == lines["length_cm"].tolist()
     assert lines["robot"].nunique() == 1
     # what a log of today lacks is no matter of age
-    manifest.write_text(manifest.read_text().replace('"schema_version": 1', '"schema_version": 2'))
+    manifest.write_text(manifest.read_text().replace('"schema_version": 1', '"schema_version": 3'))
     with pytest.raises(SessionFolderError, match="not whole"):
         finalize(made.folder)
 

@@ -1,0 +1,1 @@
+"""Many stored sessions, analysed into one table."""

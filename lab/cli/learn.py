@@ -1,0 +1,58 @@
+"""`chordlab shapes learn`: what a dictionary looks like to a robot's sensor, worked out before it is needed."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from analysis.tablestore import TableStore
+from lab.cli.choosing import (
+    CollectionOption,
+    FontOption,
+    SchedulerOption,
+    ShapeArguments,
+    WorkersOption,
+    chosen_shapes,
+)
+from lab.cli.output import JsonFlag, emit, progress_bar, say
+from lab.recognisers import tables_for
+from lab.settings import load_settings
+from lab.spread.spread import spreading
+from projector.collections import PAPER
+
+
+def learn(
+    shapes: ShapeArguments = None,
+    collection: CollectionOption = None,
+    session: Annotated[
+        Path | None, typer.Option("--settings", help="Session's TOML file: its robot and arena. Default: the virtual.")
+    ] = None,
+    font: FontOption = None,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Learn how the lines of each entry look through the robot's sensor, and keep it for the sessions to come.
+
+    A session learns what it lacks by itself; a large collection is learnt sooner by many.
+
+    Example: chordlab shapes learn --collection letters --workers 2
+    """
+    chosen = chosen_shapes(shapes, collection or (None if shapes else PAPER), font)
+    store, began_s = TableStore(), time.perf_counter()
+    with progress_bar("entries", quiet=as_json) as update:
+        tables_for(
+            {shape.name: shape for shape in chosen},
+            load_settings(session, {}),
+            progress=update,
+            store=store,
+            mapper=spreading(workers, scheduler),
+        )
+    seconds = time.perf_counter() - began_s
+    if as_json:
+        emit({"entries": [shape.name for shape in chosen], "seconds": seconds, "kept": store.folder})
+        return
+    say(f"{len(chosen)} entries are known, after {seconds:.1f} s: {store.folder}")

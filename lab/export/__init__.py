@@ -1,0 +1,1 @@
+"""A stored session in other programs' formats: CSV tables, MCAP for Foxglove, one mp4 of the film."""

@@ -1,0 +1,1 @@
+"""A session's folder on disk: how it is laid out, written, read and sealed."""
