@@ -5,6 +5,19 @@ def pytest_addoption(parser):
     parser.addoption("--full", action="store_true", help="run the long proofs (-m slow) with all their sessions")
 
 
+def pytest_collection_modifyitems(config, items):
+    """In part, a long proof that is given for several cases is run for its first alone."""
+    if config.getoption("--full"):
+        return
+    seen = set()
+    for item in items:
+        if item.get_closest_marker("slow"):
+            proof = item.nodeid.partition("[")[0]
+            if proof in seen:
+                item.add_marker(pytest.mark.skip(reason="run with --full"))
+            seen.add(proof)
+
+
 @pytest.fixture(scope="session")
 def full(request):
     """Whether the long proofs are to be run in full; else they are scaled down to fit into minutes."""

@@ -55,12 +55,13 @@ NAMED_ONLY = {
     "robot virtual": "serves until Ctrl-C; tests/robot is its client", "robot characterise": "minutes; tests/lab",
     "calibrate robot": "minutes; tests/lab", "calibrate projector": "minutes; tests/lab",
     "figures": "minutes; tests/lab", "classes": "four sessions; tests/lab",
-    "shapes learn": "minutes; tests/lab", "shapes reading": "minutes; tests/lab",
+    "shapes learn": "minutes; tests/lab", "watch": "serves until Ctrl-C; tests/lab opens it in a browser", "shapes reading": "minutes; tests/lab",
 }  # fmt: skip
 MINUTES = {  # run with --full only
     "docs/howto/read-a-word.md": "the letters are learnt",
     "docs/howto/replay.md": "all collections are learnt",
     "docs/howto/cluster.md": "workers are started",
+    "docs/tracking.md": "films are tracked",
     "docs/howto/several-robots.md": "two robots roll",
 }
 FILMED = "chordlab run --simulate --shape square"  # its block, and what it prints, with --full only
@@ -164,7 +165,9 @@ def served(command: list[str]):
 
 
 @pytest.mark.parametrize("page", OTHERS, ids=name_of)
-def test_the_commands_of_a_page_do_something(page, workshop, monkeypatch):
+def test_the_commands_of_a_page_do_something(page, workshop, monkeypatch, full):
+    if name_of(page) in MINUTES and not full:
+        pytest.skip(f"{MINUTES[name_of(page)]}: with --full")
     monkeypatch.chdir(workshop)
     Path("my_tower.geojson").unlink(missing_ok=True)  # another page's
     for line in shown_in_blocks(page):
