@@ -55,7 +55,8 @@ NAMED_ONLY = {
     "robot virtual": "serves until Ctrl-C; tests/robot is its client", "robot characterise": "minutes; tests/lab",
     "calibrate robot": "minutes; tests/lab", "calibrate projector": "minutes; tests/lab",
     "figures": "minutes; tests/lab", "classes": "four sessions; tests/lab",
-    "shapes learn": "minutes; tests/lab", "watch": "serves until Ctrl-C; tests/lab opens it in a browser", "shapes reading": "minutes; tests/lab",
+    "watch": "serves until Ctrl-C; tests/lab opens it in a browser",
+    "shapes learn": "minutes; tests/lab", "shapes reading": "minutes; tests/lab",
 }  # fmt: skip
 MINUTES = {  # run with --full only
     "docs/howto/read-a-word.md": "the letters are learnt",
