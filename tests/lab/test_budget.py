@@ -121,7 +121,9 @@ def test_uneven_directions_are_anisotropy(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_budget_of_a_usual_robot_closes(tmp_path):
+def test_the_budget_of_a_usual_robot_closes(tmp_path, full):
+    if not full:
+        pytest.skip("run with --full")
     moments = exact_moments(TOWER)
     faults = Faults(told_cm_s=30.0, footprint_cm=0.4, speed_spread=0.02, speed=1.02, image=0.99, camera_noise_cm=0.05)
     closed, pulls = 0, []
