@@ -19,7 +19,7 @@ session: setup
 	$(BIN)/chordlab run --simulate --shape eiffel $(ARGS)
 
 test: setup
-	$(BIN)/python -m pytest -n 2 $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
 
 # The same, counting the lines that were run; half as slow again.
 coverage: setup
