@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import ipaddress
 import multiprocessing
 import secrets
 import socket
@@ -13,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from lab.base.errors import RequestError
+from lab.base.loopback import is_loopback
 from lab.live.channel import Ends, make_channel
 
 if TYPE_CHECKING:
@@ -37,16 +37,6 @@ class Address:
     host: str
     token: str
     url: str
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches a server bound to ``host``."""
-    if host.lower() == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def check_nicegui() -> None:

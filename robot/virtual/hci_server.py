@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import ipaddress
 import logging
 import os
 import struct
@@ -20,6 +19,7 @@ from bumble import core
 from bumble.transport.common import PacketParser
 
 from lab.base.errors import RequestError
+from lab.base.loopback import is_loopback
 from robot.errors import RadioError
 from robot.virtual.air import QuietController
 from robot.virtual.radio import VirtualRadio
@@ -55,15 +55,6 @@ def format_endpoint(host: str, port: int) -> str:
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
-def _is_loopback(host: str) -> bool:
-    if host.lower() == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
 class HciServer:
     """Serves the air of a started radio.
 
@@ -78,7 +69,7 @@ class HciServer:
     """
 
     def __init__(self, radio: VirtualRadio, host: str, port: int, *, anywhere: bool = False) -> None:
-        if not anywhere and not _is_loopback(host):
+        if not anywhere and not is_loopback(host):
             raise RequestError(
                 f"serving on {host} would let other machines drive the robot: serve on 127.0.0.1, "
                 "or allow it (`--allow-remote`)"
