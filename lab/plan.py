@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from analysis.planning import Need, Pace, lines_for_precision, middle_and_likely, need_of, sessions_until
 from analysis.sensor import SensorModel
 from lab.base.errors import RequestError
-from lab.recognisers import LINE_WEIGHT, sensor_model, tables_for
-from lab.separability import Separability, separability
-from lab.settings import BALL_RADIUS_CM, Settings
+from lab.recognise.recognisers import LINE_WEIGHT, sensor_model, tables_for
+from lab.recognise.separability import Separability, separability
+from lab.settings.sections import BALL_RADIUS_CM
+from lab.settings.settings import Settings
 from projector.shape import Shape
 from robot.virtual.physics import BodySettings
 

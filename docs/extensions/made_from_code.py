@@ -15,7 +15,7 @@ from sphinx.application import Sphinx
 from typer.main import get_command
 
 from lab.cli.main import app as commands
-from lab.settings import Settings
+from lab.settings.settings import Settings
 
 _MARK = re.compile(r"<!-- made: (\w+) -->")
 _BOUNDS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}

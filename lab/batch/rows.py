@@ -13,9 +13,10 @@ import numpy as np
 
 from analysis.estimate import Estimate
 from analysis.montecarlo import simulate
-from lab.filmed import Filmed
-from lab.findings import summarise, to_result
-from lab.review import Reviewed, examine
+from lab.review.filmed import Filmed
+from lab.review.findings import summarise, to_result
+from lab.review.review import examine
+from lab.review.reviewed import Reviewed
 from lab.spread.task import one_line
 from lab.store.layout import SessionFolderError, to_json
 

@@ -10,10 +10,10 @@ import typer
 
 from analysis.montecarlo import available_cores
 from lab.base.errors import RequestError
-from lab.calibrate import Scales, calibrate_robot, profile_to_update, scales_of_session
+from lab.calibrate.robot import Scales, calibrate_robot, profile_to_update, scales_of_session
 from lab.cli import calibrate_optics
 from lab.cli.output import JsonFlag, complain, emit, progress_bar, say, show_table
-from lab.settings import load_settings
+from lab.settings.load import load_settings
 from robot.characterise import applied, comments_of
 from robot.profile import RobotProfile, save_profile
 

@@ -10,10 +10,10 @@ from typing import Annotated
 import typer
 
 from lab.base.errors import RequestError
-from lab.calibrate_optics import VIEWS, calibrate_by_hand, calibrate_camera, calibrate_projector
+from lab.calibrate.optics import VIEWS, calibrate_by_hand, calibrate_camera, calibrate_projector
+from lab.calibrate.stage import Operator, Step
 from lab.cli.output import JsonFlag, complain, emit, say, show_table
-from lab.settings import load_settings
-from lab.stage import Operator, Step
+from lab.settings.load import load_settings
 from tracking.board import RULER_CM, Board, print_board, read_board
 from tracking.calibration import Calibration, save_calibration
 

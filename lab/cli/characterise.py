@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 
 from analysis.montecarlo import available_cores
-from lab.calibrate import profile_to_update
-from lab.characterise import RUNS, characterise_robot, settings_for
+from lab.calibrate.characterise import RUNS, characterise_robot, settings_for
+from lab.calibrate.robot import profile_to_update
 from lab.cli.output import JsonFlag, complain, emit, progress_bar, say, show_table
 from robot.characterise import Finding
 from robot.profile import RobotProfile

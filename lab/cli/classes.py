@@ -11,9 +11,9 @@ import typer
 from analysis.figures.classes import classes_figure
 from analysis.figures.style import save_figure
 from lab.batch.places import sessions_below
-from lab.classes import Sorted, sort_sessions
 from lab.cli.choosing import leaving, picture_path
 from lab.cli.output import JsonFlag, emit, say, show_table
+from lab.recognise.classes import Sorted, sort_sessions
 
 
 def classes(

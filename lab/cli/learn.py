@@ -18,8 +18,8 @@ from lab.cli.choosing import (
     chosen_shapes,
 )
 from lab.cli.output import JsonFlag, emit, progress_bar, say
-from lab.recognisers import tables_for
-from lab.settings import load_settings
+from lab.recognise.recognisers import tables_for
+from lab.settings.load import load_settings
 from lab.spread.spread import spreading
 from projector.collections import PAPER
 

@@ -12,7 +12,7 @@ from lab.base.errors import RequestError
 from lab.live.channel import Ends
 from lab.live.live import Live
 from lab.live.server import LOOPBACK, listen, page_server
-from lab.settings import Settings
+from lab.settings.settings import Settings
 
 FOLLOWED_SPEED = 20.0
 """How many times real time a virtual bench goes while somebody looks, so that a person can follow it."""

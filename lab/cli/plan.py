@@ -14,7 +14,8 @@ from lab.cli.choosing import CollectionOption, FontOption, ShapeArguments, chose
 from lab.cli.output import JsonFlag, emit, progress_bar, say, show_table
 from lab.plan import Goal, Plan
 from lab.plan import plan as plan_sessions
-from lab.settings import Settings, load_settings
+from lab.settings.load import load_settings
+from lab.settings.settings import Settings
 from projector.collections import PAPER, load_dictionary
 
 

@@ -12,13 +12,14 @@ import numpy as np
 import typer
 
 from lab.base.errors import RequestError
-from lab.bench import keep_alive
+from lab.bench.devices import keep_alive
+from lab.bench.pictures import Picture, check_on_floor, draw_pictures
+from lab.bench.rigcheck import rig_picture
 from lab.cli.choosing import FontOption, ShapeArgument
 from lab.cli.output import JsonFlag, emit, say
 from lab.clock import run
-from lab.pictures import Picture, check_on_floor, draw_pictures
-from lab.rigcheck import rig_picture
-from lab.settings import Settings, load_settings
+from lab.settings.load import load_settings
+from lab.settings.settings import Settings
 from projector.device import ProjectorDevice, ProjectorError, open_projector
 from projector.dictionary import shape_from
 from projector.shape import Shape

@@ -13,9 +13,9 @@ from analysis.reading import Measured, measured_both_ways
 from lab.base.errors import RequestError
 from lab.cli.choosing import FontOption
 from lab.cli.output import JsonFlag, emit, lines_needed, progress_bar, say, show_table
-from lab.reading import reading_strategies
-from lab.recognisers import sensor_model
-from lab.settings import Settings
+from lab.recognise.reading import reading_strategies
+from lab.recognise.recognisers import sensor_model
+from lab.settings.settings import Settings
 from projector.dictionary import load_dictionary, shape_from
 from projector.text import TEXT_PREFIX
 

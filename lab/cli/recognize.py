@@ -11,8 +11,8 @@ import typer
 from analysis.reading import Reading, read_word
 from lab.base.errors import RequestError
 from lab.cli.output import JsonFlag, emit, say, show_table
-from lab.recognisers import Recognition
-from lab.review import recognition_of
+from lab.recognise.recognisers import Recognition
+from lab.review.review import recognition_of
 from lab.store.reader import SessionReader
 from lab.store.tables import tables_of
 from projector.collections import COLLECTIONS, charter_words

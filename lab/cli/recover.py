@@ -10,8 +10,8 @@ from typing import Annotated, Any
 import typer
 
 from lab.cli.output import JsonFlag, emit, say, show_table
-from lab.recover import Recovery
-from lab.recover import recover as mend
+from lab.reopen.recover import Recovery
+from lab.reopen.recover import recover as mend
 from lab.store.writer import disk_faults
 
 

@@ -15,11 +15,11 @@ import numpy as np
 import typer
 
 from lab.base.errors import RequestError
+from lab.bench.pictures import check_on_floor, draw_pictures
+from lab.bench.world import virtual_world
 from lab.cli.output import JsonFlag, emit, say, show_table
 from lab.clock import run
-from lab.pictures import check_on_floor, draw_pictures
-from lab.settings import load_settings
-from lab.world import virtual_world
+from lab.settings.load import load_settings
 from projector.dictionary import shape_from
 from robot.bolt import Bolt, Heard, scan
 from robot.device import Sample

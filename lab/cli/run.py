@@ -17,18 +17,19 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from lab.base.errors import RequestError
+from lab.bench.replayed import replay_devices
 from lab.cli.output import JsonFlag, complain, emit, progress_bar, say
 from lab.cli.paging import HostOption, LiveFlag, Paging, PortOption, SpeedOption, TokenOption, paging
 from lab.cli.recognize import read_letters
-from lab.experiment import Finished, run_experiment
-from lab.ledger import Progress as Step
-from lab.ledger import Watcher
 from lab.live.server import LOOPBACK
-from lab.replayed import replay_devices
-from lab.resume import cannot_go_on, pick_up
-from lab.resume import resume as resume_session
-from lab.review import review
-from lab.settings import Settings, load_settings
+from lab.reopen.resume import cannot_go_on, pick_up
+from lab.reopen.resume import resume as resume_session
+from lab.review.review import review
+from lab.session.experiment import Finished, run_experiment
+from lab.session.ledger import Progress as Step
+from lab.session.ledger import Watcher
+from lab.settings.load import load_settings
+from lab.settings.settings import Settings
 from lab.store.lock import writing
 from lab.store.seal import write_checksums
 from lab.store.tables import finalize

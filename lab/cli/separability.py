@@ -14,9 +14,9 @@ from analysis.figures.style import save_figure
 from analysis.figures.values import Entry
 from lab.cli.choosing import CollectionOption, FontOption, ShapeArguments, chosen_shapes, leaving, picture_path
 from lab.cli.output import JsonFlag, emit, lines_needed, progress_bar, say, show_table
-from lab.recognisers import sensor_model
-from lab.separability import PairProspects, Prospect, Separability, separability
-from lab.settings import Settings
+from lab.recognise.recognisers import sensor_model
+from lab.recognise.separability import PairProspects, Prospect, Separability, separability
+from lab.settings.settings import Settings
 from projector.collections import PAPER
 from projector.dictionary import Shape
 

@@ -21,7 +21,7 @@ from lab.cli.learn import learn
 from lab.cli.output import JsonFlag, emit, say, show_table
 from lab.cli.reading import show_reading
 from lab.cli.separability import show_separability
-from lab.settings import ArenaSettings
+from lab.settings.sections import ArenaSettings
 from projector.collections import DRAWN, PAPER, drawn_files
 from projector.dictionary import Shape, load_dictionary
 from projector.draw import draw_gallery, draw_shape

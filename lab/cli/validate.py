@@ -12,8 +12,8 @@ from analysis.figures.budget import name_of
 from analysis.report.words import signed, signed_with
 from lab.base.errors import RequestError
 from lab.cli.output import JsonFlag, emit, progress_bar, say, show_table
-from lab.reread import Thresholds, figures_of, reread
-from lab.review import review
+from lab.reopen.reread import Thresholds, figures_of, reread
+from lab.review.review import review
 from lab.store.reader import SessionReader
 from lab.store.seal import write_checksums
 from lab.store.tables import Tables, tables_of, write_table

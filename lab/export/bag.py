@@ -15,7 +15,7 @@ from lab.export import schemas
 from lab.export.aside import whole_file
 from lab.export.messages import WorldClock, in_time, stretches_of
 from lab.export.source import Source
-from lab.stored import stored_shape
+from lab.reopen.stored import stored_shape
 
 Progress = Callable[[int, int], None]
 

@@ -18,8 +18,8 @@ from shapely import MultiPolygon, Polygon
 
 from lab.export import schemas
 from lab.export.source import Segment, Source
+from lab.reopen.stored import stored_settings, stored_shape
 from lab.store.layout import SessionFolderError
-from lab.stored import stored_settings, stored_shape
 from tracking.video import read_frames
 
 FRAME = "arena"

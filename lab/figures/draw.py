@@ -17,7 +17,7 @@ from lab.base.errors import ChordlabError, RequestError
 from lab.base.files import write_aside
 from lab.figures.robots import NO_SESSIONS, Stored
 from lab.figures.workbench import COSTS, ELLIPSES_AT, WORD, Scale, Workbench
-from lab.settings import Settings
+from lab.settings.settings import Settings
 from projector.shape import Font
 from projector.text import TEXT_PREFIX
 

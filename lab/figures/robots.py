@@ -21,13 +21,13 @@ from analysis.estimate import running_estimates
 from analysis.figures.paper.explored import Explored
 from analysis.montecarlo import Lines
 from lab.base.errors import ChordlabError, RequestError
-from lab.filmed import SHORTEST_RUN_CM
-from lab.review import examine, keep
-from lab.settings import Settings
+from lab.reopen.stored import stored_settings, stored_shape
+from lab.review.filmed import SHORTEST_RUN_CM
+from lab.review.review import examine, keep
+from lab.settings.settings import Settings
 from lab.store.lock import is_being_written
 from lab.store.reader import SessionReader
 from lab.store.tables import Tables, tables_of
-from lab.stored import stored_settings, stored_shape
 from projector.shape import Shape
 from tracking.isotropy import TooFewLinesError, examine_lines
 

@@ -25,8 +25,8 @@ from analysis.reading import Strategies, compare_strategies, lines_in_a_dictiona
 from analysis.scaling import PowerLaw, fit_scatter
 from analysis.tablestore import Mapper
 from lab.figures.robots import NO_SESSIONS, Stored, simulated_robot
-from lab.separability import separability
-from lab.settings import Settings
+from lab.recognise.separability import separability
+from lab.settings.settings import Settings
 from projector.collections import load_dictionary
 from projector.shape import Font, Shape, Silhouette
 from projector.text import TEXT_PREFIX, Typeface, find_font

@@ -17,13 +17,13 @@ from shapely.geometry import MultiPolygon, Polygon
 from analysis.quadrature import Moments, exact_moments
 from analysis.recognition import Recogniser
 from lab.base.errors import RequestError
-from lab.experiment import dictionary_with
 from lab.live.story import Rolled, Story
-from lab.recognisers import recogniser_for
-from lab.settings import Settings
+from lab.recognise.recognisers import recogniser_for
+from lab.reopen.stored import stored_settings, stored_shape
+from lab.session.experiment import dictionary_with
+from lab.settings.settings import Settings
 from lab.store.layout import EVENTS, LIGHT, SessionFolderError
 from lab.store.reader import SessionReader
-from lab.stored import stored_settings, stored_shape
 from projector.shape import Shape
 
 Floats = NDArray[np.float64]

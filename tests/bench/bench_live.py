@@ -10,10 +10,10 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from lab.experiment import run_experiment
 from lab.live.live import Live
 from lab.live.server import listen, page_server
-from lab.settings import load_settings
+from lab.session.experiment import run_experiment
+from lab.settings.load import load_settings
 from tests.lab.conftest import STARTED
 from tests.lab.pages import CHROMIUM, need_chromium
 

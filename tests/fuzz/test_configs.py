@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from lab.base.errors import RequestError
-from lab.recognisers import sensor_model
-from lab.settings import Settings, load_settings
+from lab.recognise.recognisers import sensor_model
+from lab.settings.load import load_settings
+from lab.settings.settings import Settings
 from lab.store.layout import to_json
 from robot.profile import RobotProfile, load_profile, save_profile
 from tests.fuzz.harness import fuzz

@@ -12,14 +12,14 @@ import pandas as pd
 import pytest
 
 from lab.base.errors import RequestError
-from lab.calibrate import profile_then
-from lab.reread import reread
-from lab.review import examine, recognition_of
+from lab.calibrate.robot import profile_then
+from lab.reopen.reread import reread
+from lab.reopen.stored import stored_settings
+from lab.review.review import examine, recognition_of
+from lab.review.watched import readings_of
 from lab.store.layout import SessionFolderError
 from lab.store.reader import SessionReader
 from lab.store.tables import finalize, tables_of
-from lab.stored import stored_settings
-from lab.watched import readings_of
 from tests.fuzz.harness import fuzz, is_refused
 from tests.fuzz.mutate import NUMBERS, TEXTS, mangled, pick
 from tests.lab.conftest import roll
@@ -236,8 +236,8 @@ def hook(event, args):
 sys.addaudithook(hook)
 from lab.base.errors import ChordlabError
 from lab.batch.rows import row_of
-from lab.reread import reread
-from lab.review import examine, review
+from lab.reopen.reread import reread
+from lab.review.review import examine, review
 from lab.store.tables import finalize
 
 for read in (finalize, lambda one: review(one, report=True), reread, row_of):

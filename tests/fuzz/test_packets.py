@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lab.run import Run
+from lab.session.run import Run
 from lab.store.layout import to_json
 from robot import commands
 from robot.collision import AXES, wall_normal_heading

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from lab.batch.rows import row_of
-from lab.review import examine
+from lab.reopen.stored import stored_settings, stored_shape
+from lab.review.review import examine
+from lab.session.tally import stored_estimate
 from lab.store.reader import SessionReader
 from lab.store.tables import tables_of
-from lab.stored import stored_settings, stored_shape
-from lab.tally import stored_estimate
 from tests.fuzz.harness import fuzz, is_refused
 from tests.fuzz.mutate import hostile, mangled, mutated, pick
 from tests.fuzz.mutate import to_json as broken_json

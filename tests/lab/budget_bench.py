@@ -14,7 +14,7 @@ from shapely import affinity, box
 
 from analysis.estimate import estimate
 from analysis.quadrature import exact_moments
-from lab.settings import load_settings
+from lab.settings.load import load_settings
 from lab.store.layout import LIGHT, line_folder
 from lab.store.reader import SessionReader
 from tracking.runs import TRUE_LINES

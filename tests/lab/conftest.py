@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from lab.experiment import Finished, run_experiment
-from lab.ledger import Progress
-from lab.settings import load_settings
+from lab.session.experiment import Finished, run_experiment
+from lab.session.ledger import Progress
+from lab.settings.load import load_settings
 
 STARTED = datetime(2026, 11, 23, 10, 42)
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from lab.experiment import Finished
-from lab.resume import pick_up, resume
+from lab.reopen.resume import pick_up, resume
+from lab.session.experiment import Finished
 from robot.onboard import Estimator
 
 RESUMED = datetime(2026, 11, 24, 9, 0)

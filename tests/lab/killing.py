@@ -17,7 +17,7 @@ import traceback
 from dataclasses import dataclass
 from pathlib import Path
 
-from lab.recover import recover
+from lab.reopen.recover import recover
 from lab.store.writer import SessionWriter
 from tests.lab.conftest import roll
 

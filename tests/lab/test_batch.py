@@ -23,7 +23,7 @@ from lab.batch.digests import Digests
 from lab.batch.places import places_below
 from lab.batch.rows import COLUMNS, row_of
 from lab.batch.shapes import per_shape
-from lab.recognisers import Recognition
+from lab.recognise.recognisers import Recognition
 from lab.store.lock import writing
 from lab.store.seal import write_checksums
 from projector.dictionary import load_dictionary

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from lab.experiment import run_experiment
-from lab.rigcheck import RigError
-from lab.settings import load_settings
+from lab.bench.rigcheck import RigError
+from lab.session.experiment import run_experiment
+from lab.settings.load import load_settings
 from lab.store.reader import SessionReader
 from projector.device import ProjectorError
 from projector.virtual import VirtualProjector

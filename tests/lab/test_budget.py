@@ -12,9 +12,9 @@ from analysis.budget import CAUSES
 from analysis.estimate import estimate
 from analysis.quadrature import exact_moments
 from analysis.sensor import SensorModel
-from lab.budget import session_budget
 from lab.cli.main import app
-from lab.review import examine, review
+from lab.review.budget import session_budget
+from lab.review.review import examine, review
 from tests.lab.budget_bench import BLOCK, TOWER, Faults, bench_session, thrown
 from tests.lab.conftest import roll
 from tracking.isotropy import examine_lines

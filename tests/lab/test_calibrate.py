@@ -13,9 +13,17 @@ import pytest
 from typer.testing import CliRunner
 
 from lab.base.errors import RequestError
-from lab.calibrate import Wheels, calibrate_robot, fit_runs, profile_to_update, scales_of, scales_of_session, speeds_for
+from lab.calibrate.robot import (
+    Wheels,
+    calibrate_robot,
+    fit_runs,
+    profile_to_update,
+    scales_of,
+    scales_of_session,
+    speeds_for,
+)
 from lab.cli.calibrate import app, effects_of
-from lab.settings import load_settings
+from lab.settings.load import load_settings
 from robot.characterise import applied, comments_of
 from robot.profile import RobotProfile, load_profile, save_profile
 from robot.virtual.bolt import body_settings
@@ -158,7 +166,7 @@ def hush(_: str) -> None:
 
 def test_hidden_scales_are_recovered_within_half_a_percent(tmp_path: Path, monkeypatch) -> None:
     # The twin's odometer would else be off by a draw of its own, which no profile tells.
-    monkeypatch.setattr("lab.world.body_settings", lambda p, s: body_settings(p, replace(s, locator_error=0.0)))
+    monkeypatch.setattr("lab.bench.world.body_settings", lambda p, s: body_settings(p, replace(s, locator_error=0.0)))
     scales = calibrate_robot(bench(tmp_path), RobotProfile(), 12, workers=1, say=hush)
     assert scales.cm_s_per_unit.value == pytest.approx(0.532, rel=0.005)
     assert scales.locator_scale.value == pytest.approx(1.064, rel=0.005)

@@ -16,11 +16,11 @@ from typer.testing import CliRunner
 
 from lab.base.errors import RequestError
 from lab.base.pinhole import Pinhole
-from lab.boardviews import CoverageError, stored_views
-from lab.calibrate_optics import PlacementError, calibrate_camera, calibrate_projector
+from lab.bench.rigcheck import RigError, check_rig, rig_markers, rig_picture
+from lab.calibrate.boardviews import CoverageError, stored_views
+from lab.calibrate.optics import PlacementError, calibrate_camera, calibrate_projector
 from lab.cli.calibrate_optics import camera, person, projector
-from lab.rigcheck import RigError, check_rig, rig_markers, rig_picture
-from lab.settings import load_settings
+from lab.settings.load import load_settings
 from projector.virtual import VirtualProjector
 from tracking.board import Board, print_board
 from tracking.boardscene import board_scene, held, laid
@@ -65,7 +65,7 @@ def bench(monkeypatch, tmp_path):
 
     def make(seed: int) -> tuple[Truth, Path]:
         truth = hide(seed)
-        monkeypatch.setattr("lab.settings.Settings.true_optics", lambda _: (truth.camera, truth.projector))
+        monkeypatch.setattr("lab.settings.settings.Settings.true_optics", lambda _: (truth.camera, truth.projector))
         session = tmp_path / "bench.toml"
         session.write_text(f'seed = {seed}\n[camera_optics]\ncalibration = "{tmp_path / "camera.json"}"\n')
         return truth, session
@@ -256,7 +256,8 @@ def test_a_picture_that_lands_elsewhere_is_refused(bench, monkeypatch) -> None:
 
     monkeypatch.setattr(VirtualProjector, "show", slip)
     monkeypatch.setattr(
-        "lab.settings.Settings.true_optics", lambda _: (load_settings(None).camera_optics.pinhole(), truth.projector)
+        "lab.settings.settings.Settings.true_optics",
+        lambda _: (load_settings(None).camera_optics.pinhole(), truth.projector),
     )
     with pytest.raises(PlacementError, match="limit 5") as caught:
         calibrate_projector(load_settings(None), person(), say=lambda _: None)

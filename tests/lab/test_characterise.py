@@ -12,9 +12,10 @@ import typer
 from typer.testing import CliRunner
 
 from lab.base.errors import RequestError
-from lab.characterise import characterise_robot, settings_for
+from lab.calibrate.characterise import characterise_robot, settings_for
 from lab.cli.characterise import characterise
-from lab.settings import Settings, load_settings
+from lab.settings.load import load_settings
+from lab.settings.settings import Settings
 from robot.characterise import CharacteriseError
 from robot.profile import RobotProfile, load_profile, save_profile
 

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from lab.cli.main import main
-from lab.settings import load_settings
+from lab.settings.load import load_settings
 from projector.dictionary import load_dictionary
 from projector.patterns import fiducials
 

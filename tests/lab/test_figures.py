@@ -14,7 +14,7 @@ from lab.cli.main import main
 from lab.figures.draw import MAKERS, draw_figures
 from lab.figures.robots import simulated_robot, stored_robots
 from lab.figures.workbench import COSTS, Scale, Workbench
-from lab.settings import Settings
+from lab.settings.settings import Settings
 from lab.store.reader import SessionReader
 from lab.store.tables import tables_of
 from projector.dictionary import load_dictionary

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from lab.cli.main import main
-from lab.review import review
-from lab.roller import SessionError
+from lab.review.review import review
+from lab.session.roller import SessionError
 from lab.store.reader import SessionReader
 from lab.store.tables import tables_of
 from robot.errors import ReconnectError

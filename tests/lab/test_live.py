@@ -12,11 +12,11 @@ import pytest
 
 from lab.clock import Pace, VirtualTimeLoop
 from lab.clock import run as run_on_clock
-from lab.experiment import run_experiment
 from lab.live.channel import make_channel, read_news, send_command, send_news, take_commands
 from lab.live.feed import Feed
 from lab.live.live import Live
-from lab.settings import load_settings
+from lab.session.experiment import run_experiment
+from lab.settings.load import load_settings
 from lab.store.reader import SessionReader
 from robot.device import Sample
 from tests.lab.conftest import STARTED

@@ -6,8 +6,8 @@ import shapely
 from shapely import Point, box
 
 from lab.base.errors import RequestError
-from lab.pictures import check_on_floor, draw_pictures
-from lab.settings import ArenaSettings, OpticsSettings
+from lab.bench.pictures import check_on_floor, draw_pictures
+from lab.settings.sections import ArenaSettings, OpticsSettings
 from projector.render import RenderError, render
 from projector.shape import Shape, ShapeError
 

@@ -7,10 +7,11 @@ import pytest
 
 from lab.cli.main import main
 from lab.plan import charge_s, plan
-from lab.recognisers import sensor_model
-from lab.separability import separability
-from lab.settings import Settings, load_settings
-from lab.simulated import check_against_simulation
+from lab.recognise.recognisers import sensor_model
+from lab.recognise.separability import separability
+from lab.review.simulated import check_against_simulation
+from lab.settings.load import load_settings
+from lab.settings.settings import Settings
 from lab.store.reader import SessionReader
 from lab.store.tables import tables_of
 from projector.collections import load_dictionary

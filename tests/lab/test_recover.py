@@ -11,7 +11,8 @@ import pandas as pd
 import pytest
 
 from lab.cli.main import main
-from lab.recover import recover
+from lab.reopen.recover import recover
+from lab.session.tally import stored_estimate
 from lab.store.layout import SessionFolderError
 from lab.store.lock import writing
 from lab.store.reader import SessionReader
@@ -19,7 +20,6 @@ from lab.store.salvage import salvage
 from lab.store.seal import write_checksums
 from lab.store.tables import finalize
 from lab.store.writer import SessionWriter
-from lab.tally import stored_estimate
 from tests.lab.conftest import STARTED, roll
 from tests.lab.killing import digests, mend_dying
 from tests.lab.test_store import line_event

@@ -10,11 +10,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lab.recover import recover
+from lab.reopen.recover import recover
+from lab.session.tally import stored_estimate
 from lab.store.layout import SessionFolderError
 from lab.store.reader import SessionReader
 from lab.store.tables import Tables, tables_of
-from lab.tally import stored_estimate
 from tests.lab.killing import Nursery, digests
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs fork, SIGKILL and /proc")

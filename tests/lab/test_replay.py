@@ -10,12 +10,12 @@ import pytest
 from typer.testing import CliRunner
 
 from lab.base.errors import RequestError
+from lab.bench.replayed import replay_devices
 from lab.cli.main import app
-from lab.experiment import run_experiment
-from lab.replayed import replay_devices
-from lab.resume import pick_up, resume
-from lab.review import examine
-from lab.settings import load_settings
+from lab.reopen.resume import pick_up, resume
+from lab.review.review import examine
+from lab.session.experiment import run_experiment
+from lab.settings.load import load_settings
 from lab.store.layout import SessionFolderError
 from lab.store.reader import SessionReader
 from lab.store.tables import tables_of

@@ -9,12 +9,12 @@ import pytest
 from typer.testing import CliRunner
 
 from lab.base.errors import RequestError
+from lab.bench.replayed import replay_devices
 from lab.cli.main import app
-from lab.experiment import run_experiment
-from lab.replayed import replay_devices
-from lab.reread import Thresholds, figures_of, reread
-from lab.rerun import session_levels
-from lab.settings import load_settings
+from lab.reopen.reread import Thresholds, figures_of, reread
+from lab.reopen.rerun import session_levels
+from lab.session.experiment import run_experiment
+from lab.settings.load import load_settings
 from lab.store.layout import SessionFolderError
 from lab.store.reader import SessionReader
 from lab.store.tables import Tables, tables_of

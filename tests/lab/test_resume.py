@@ -8,16 +8,16 @@ import pandas as pd
 import pytest
 
 from analysis.estimate import estimate
-from lab.ledger import Ledger
-from lab.parts import LearntLevels, parts_of
-from lab.resume import pick_up, take_up
-from lab.review import recognition_of, review
-from lab.settings import load_settings
+from lab.reopen.parts import LearntLevels, parts_of
+from lab.reopen.resume import pick_up, take_up
+from lab.reopen.stored import stored_settings
+from lab.review.review import recognition_of, review
+from lab.session.ledger import Ledger
+from lab.session.tally import SharedTally, SoloTally, stored_estimate
+from lab.settings.load import load_settings
 from lab.store.layout import SessionFolderError
 from lab.store.reader import SessionReader
 from lab.store.tables import tables_of
-from lab.stored import stored_settings
-from lab.tally import SharedTally, SoloTally, stored_estimate
 from robot.cutlines import CutLine, estimate_interrupted
 from tests.lab.conftest import roll
 from tests.lab.cutting import Log, cut_after, estimates_of_one_robot, estimates_told, go_on

@@ -15,8 +15,8 @@ import pytest
 from lab.base.errors import RequestError
 from lab.cli.main import main
 from lab.clock import run as run_on_clock
-from lab.experiment import run_experiment
-from lab.resume import pick_up, resume
+from lab.reopen.resume import pick_up, resume
+from lab.session.experiment import run_experiment
 from lab.store.layout import SessionFolderError
 from lab.store.seal import write_checksums
 from tests.lab.conftest import roll

@@ -9,10 +9,10 @@ import pytest
 from shapely import Point, box
 
 from analysis.report.verdict import verdict_of
-from lab.findings import summarise, to_result
-from lab.review import examine, review
-from lab.runcheck import check_runs
-from lab.settings import load_settings
+from lab.review.findings import summarise, to_result
+from lab.review.review import examine, review
+from lab.review.runcheck import check_runs
+from lab.settings.load import load_settings
 from lab.store.reader import SessionReader
 from lab.store.tables import tables_of
 from tests.lab.conftest import roll

@@ -14,7 +14,7 @@ from analysis.quadrature import exact_moments
 from analysis.recognition import GaussianRecogniser
 from analysis.sensor import SensorModel
 from lab.base.errors import RequestError
-from lab.separability import separability
+from lab.recognise.separability import separability
 from projector.collections import load_dictionary
 from projector.outlines import installed_font
 from projector.shape import Shape

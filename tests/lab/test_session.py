@@ -10,9 +10,9 @@ import pytest
 from shapely import LineString, Point, box
 
 from lab.base.errors import ChordlabError, RequestError
-from lab.experiment import run_experiment
-from lab.review import recognition_of, review
-from lab.settings import load_settings
+from lab.review.review import recognition_of, review
+from lab.session.experiment import run_experiment
+from lab.settings.load import load_settings
 from lab.store.reader import SessionReader
 from lab.store.tables import finalize, tables_of
 from robot.crossings import Levels, LevelsError, crossings_of
@@ -142,10 +142,12 @@ def test_a_disc_arena_and_odometry(tmp_path):
 
 def test_a_robot_that_sets_off_into_the_wall_draws_again(tmp_path, monkeypatch):
     """With a bump felt 0.5 rad off, many headings point into the wall: those runs stall, and are not lines."""
-    import lab.world
+    import lab.bench.world
     from robot.virtual.body import BodySettings
 
-    monkeypatch.setattr(lab.world, "BodySettings", lambda **kwargs: BodySettings(**{**kwargs, "bump_angle_rad": 0.5}))
+    monkeypatch.setattr(
+        lab.bench.world, "BodySettings", lambda **kwargs: BodySettings(**{**kwargs, "bump_angle_rad": 0.5})
+    )
     lines = tables_of(SessionReader(roll(tmp_path, stop__lines=15).folder)).lines
     stalled = lines[lines["ended"] == "stall"]
     assert len(stalled) >= 2

@@ -8,8 +8,8 @@ import pytest
 from shapely import LineString, Point, box
 
 from lab.base.errors import RequestError
-from lab.run import Run
-from lab.settings import parse_settings
+from lab.session.run import Run
+from lab.settings.load import parse_settings
 from robot.crossings import CrossingDetector, Levels
 from robot.device import Sample
 from robot.turning import Leg

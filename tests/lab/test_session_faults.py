@@ -9,7 +9,7 @@ import pytest
 
 from lab.base.errors import ChordlabError
 from lab.cli.main import main
-from lab.roller import SessionError
+from lab.session.roller import SessionError
 from lab.store.reader import SessionReader
 from robot.errors import ReconnectError
 from tests.lab.traces import area_perimeter, rolled

@@ -5,7 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lab.base.errors import RequestError
-from lab.settings import BALL_RADIUS_CM, Settings, load_settings, parse_settings
+from lab.settings.load import load_settings, parse_settings
+from lab.settings.sections import BALL_RADIUS_CM
+from lab.settings.settings import Settings
 
 
 def test_defaults_are_a_virtual_session():

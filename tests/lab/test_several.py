@@ -9,11 +9,11 @@ import pytest
 
 from lab.base.errors import RequestError
 from lab.cli.main import main
-from lab.review import review
-from lab.settings import load_settings
+from lab.review.review import review
+from lab.session.tally import stored_estimate
+from lab.settings.load import load_settings
 from lab.store.reader import SessionReader
 from lab.store.tables import tables_of
-from lab.tally import stored_estimate
 from robot.virtual.faults import Fault
 from tests.lab.traces import area_perimeter, rolled
 
@@ -200,7 +200,7 @@ def test_a_crowd_from_the_command_line(tmp_path, capsys):
 
 def test_faults_reach_the_robot_that_they_name(bereft):
     """The settings' faults are counted robot by robot."""
-    from lab.world import _faults
+    from lab.bench.world import _faults
 
     settings = load_settings(None, {"virtual.faults": [{"kind": "vanish", "at_s": 3, "for_s": 4, "robot": 1}]})
     assert _faults(settings, 0) == []

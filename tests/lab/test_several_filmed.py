@@ -5,9 +5,9 @@ import pandas as pd
 import pytest
 from shapely import Polygon
 
-from lab.attribution import attribute, lines_from_the_edge
-from lab.review import review
-from lab.settings import load_settings
+from lab.review.attribution import attribute, lines_from_the_edge
+from lab.review.review import review
+from lab.settings.load import load_settings
 from lab.store.reader import SessionReader
 from tests.lab.traces import rolled
 from tracking.video import read_frames

@@ -13,7 +13,7 @@ from analysis.sensor import SensorModel
 from analysis.tablestore import TableStore, learn_lines
 from lab.base.errors import RequestError
 from lab.figures.workbench import Scale, Workbench
-from lab.settings import Settings
+from lab.settings.settings import Settings
 from lab.spread.spread import ItemFailedError, spread, spreading
 from lab.spread.task import Failure
 from lab.spread.versions import differences, digest_of_source, versions

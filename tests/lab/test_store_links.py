@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from lab.base.files import make_folder, write_aside
-from lab.review import review
+from lab.review.review import review
 from lab.store.layout import SessionFolderError
 from lab.store.reader import SessionReader
 from lab.store.seal import verify_checksums, write_checksums

@@ -7,10 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lab.run import Run
-from lab.settings import load_settings
+from lab.session.run import Run
+from lab.session.tally import SharedTally, SoloTally, stored_estimate, tally_for
+from lab.settings.load import load_settings
 from lab.store.tables import CROSSING_COLUMNS, LINE_COLUMNS
-from lab.tally import SharedTally, SoloTally, stored_estimate, tally_for
 from robot.crossings import Crossing, CrossingDetector, Levels
 from robot.cutlines import CutLine, estimate_interrupted
 from robot.device import Sample

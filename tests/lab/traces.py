@@ -14,8 +14,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lab.experiment import Finished, run_experiment
-from lab.settings import load_settings
+from lab.session.experiment import Finished, run_experiment
+from lab.settings.load import load_settings
 from robot.virtual.body import Body
 from tests.lab.conftest import STARTED
 
@@ -75,7 +75,7 @@ def bodies_kept() -> Iterator[list[TracedBody]]:
         return kept[-1]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lab.world.Body", make)
+        patch.setattr("lab.bench.world.Body", make)
         yield kept
 
 

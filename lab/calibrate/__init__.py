@@ -1,0 +1,1 @@
+"""What a lab measures of itself before a session: camera, projector, robot."""

@@ -1,0 +1,1 @@
+"""Names for what the robot measured, as its sensor will see them."""

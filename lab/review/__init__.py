@@ -1,0 +1,1 @@
+"""A stored session examined: its film, its recognition, its errors."""

@@ -1,0 +1,1 @@
+"""A session as it runs: preflight, rolling, the sums, the reason to stop."""

@@ -1,0 +1,1 @@
+"""The settings of a session: a TOML file and the flags, checked."""
