@@ -36,7 +36,7 @@ def _command(command: Any, words: tuple[str, ...]) -> Iterator[str]:
         return
     told, _, example = inspect.cleandoc(command.help or "").partition("Example:")
     yield f"{'#' * len(words)} {' '.join(words)}\n\n{told.strip()}\n\n```sh\n{example.strip()}\n```\n"
-    yield "| | | default |\n|---|---|---|"
+    yield "| given as | meaning | default |\n|---|---|---|"
     for parameter in command.params:
         if not getattr(parameter, "hidden", False):
             yield _parameter(parameter)

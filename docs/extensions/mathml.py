@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import re
+
 from docutils import nodes
 from latex2mathml.converter import convert
 from sphinx.application import Sphinx
 from sphinx.writers.html5 import HTML5Translator
 
-_SCRIPT_L = '<mi mathvariant="script">L</mi>'
+_VARIANTS = re.compile(r'<mi mathvariant="(script|bold)">([A-Za-z])</mi>')
+_FIRST = {"script": (0x1D4D0, 0x1D4EA), "bold": (0x1D400, 0x1D41A)}  # of the alphabets' capitals and small letters
 
 
 def mathml(formula: str, display: str) -> str:
     """A formula in LaTeX as MathML; browsers know letters by their characters, not by a variant of plain ones."""
-    return convert(formula, display=display).replace(_SCRIPT_L, "<mi>𝓛</mi>")
+    return _VARIANTS.sub(_lettered, convert(formula, display=display))
+
+
+def _lettered(variant: re.Match[str]) -> str:
+    kind, letter = variant.groups()
+    capitals, smalls = _FIRST[kind]
+    character = chr(capitals + ord(letter) - ord("A") if letter.isupper() else smalls + ord(letter) - ord("a"))
+    return f'<mi mathvariant="normal">{character}</mi>'
 
 
 def in_line(translator: HTML5Translator, node: nodes.math) -> None:

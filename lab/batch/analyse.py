@@ -22,6 +22,7 @@ from lab.spread.versions import versions
 from lab.store.layout import CHECKSUMS, SessionFolderError
 from lab.store.lock import writer_of
 from lab.store.seal import verify_checksums
+from projector.text import find_font
 
 Progress = Callable[[int, int], None]
 Row = dict[str, Any]
@@ -95,7 +96,7 @@ class _Batch:
         self.rows: dict[int, Row] = {}
         self.computed = 0
         self._places, self._cache, self._again, self._progress = places, cache, again, progress
-        self._versions = versions()
+        self._versions = versions() | {"font": find_font().sha256}  # letters are set in it again
         self._keys: dict[Path, str] = {}  # of what is under way, by the folder that stands for its content
         self._same: dict[str, list[tuple[int, Row]]] = {}  # key → the sessions of that content
 

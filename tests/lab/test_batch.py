@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -185,6 +186,10 @@ def test_what_is_known_is_not_worked_out_again(sessions, tmp_path, monkeypatch, 
         assert here(sessions, cache).computed == 3
     with monkeypatch.context() as patched:
         patched.setattr(analysis_of_many, "_SETTINGS", {"columns": ["other"]})
+        assert here(sessions, cache).computed == 3
+    with monkeypatch.context() as patched:
+        another = replace(analysis_of_many.find_font(), sha256="of another font")
+        patched.setattr(analysis_of_many, "find_font", lambda: another)
         assert here(sessions, cache).computed == 3
     damaged = sorted((tmp_path / "cache/rows").rglob("*.json"))
     for path in damaged:
