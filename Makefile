@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 ROOMS := lab projector tracking robot analysis
 
-.PHONY: setup session test coverage check bench docs clean
+.PHONY: setup session samples notebooks test coverage check bench docs clean
 
 setup: .venv/ready
 
@@ -17,6 +17,14 @@ setup: .venv/ready
 # A full session on the virtual bench: the Eiffel Tower, a virtual BOLT, a filmed floor, a report.
 session: setup
 	$(BIN)/chordlab run --simulate --shape eiffel $(ARGS)
+
+# The stored sessions of data/sessions, rolled anew from the settings beside them.
+samples: setup
+	$(BIN)/python data/sessions/make.py
+
+# The notebooks, run anew, with what they print and draw.
+notebooks: setup
+	$(BIN)/python docs/notebooks/make.py
 
 test: setup
 	$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)

@@ -19,7 +19,7 @@ from shapely.geometry import Polygon
 
 from analysis.boundary import Geometry
 from analysis.exploration import Turning, follow_sessions
-from analysis.invariants import area_cm2, perimeter_cm
+from analysis.invariants import sizes
 from analysis.montecarlo import running_bands
 from analysis.sensor import SensorModel
 from lab.base.errors import RequestError
@@ -161,6 +161,5 @@ def band_test(measured: Curves, simulated: Curves, *, level: float = 0.95) -> Ba
 
 def _curves(checkpoints: Ints, sums: Floats) -> Curves:
     """Eq. 1 from sums (…, 3) of (k, 𝓛_1, 𝓛_3)."""
-    k, l1, l3 = np.moveaxis(sums, -1, 0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return Curves(checkpoints, area_cm2(l1, l3), perimeter_cm(k, l1, l3))
+    area, perimeter = np.ascontiguousarray(np.moveaxis(sizes(sums), -1, 0))
+    return Curves(checkpoints, area, perimeter)

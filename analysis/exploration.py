@@ -7,7 +7,6 @@ that or not. This simulates whole sessions, many at once.
 
 from __future__ import annotations
 
-from enum import StrEnum
 from time import perf_counter
 
 import numpy as np
@@ -20,6 +19,7 @@ from analysis.boundary import Boundary, Geometry
 from analysis.invariants import area_cm2, perimeter_cm
 from analysis.montecarlo import Simulation, cross_lines
 from analysis.sensor import SensorModel
+from analysis.turning import Turning
 from lab.base.errors import RequestError
 
 Floats = NDArray[np.float64]
@@ -29,19 +29,6 @@ _SHORTEST_CM = 0.5  # a run below it meets nothing; bounds the weight 1/length
 _OUTSIDE = 1e-9  # of the shape's area
 _CIRCLE_SIDES = 1024
 _MOST_RUNS = 10_000  # rolled for one crossing line before the shape counts as out of reach
-
-
-class Turning(StrEnum):
-    """How a simulated robot draws its next line."""
-
-    LAMBERT = "lambert"
-    """Cosine law at the edge: uniform isotropic lines."""
-    UNIFORM = "uniform"
-    """Any inward angle alike: biased."""
-    UNIFORM_WEIGHTED = "uniform-weighted"
-    """Any inward angle alike, each line weighted by its length: right in a disc alone."""
-    INTERIOR = "interior"
-    """Random interior stops, a fresh heading at each, lines weighted by 1/length."""
 
 
 def disc_arena(radius_cm: float) -> Polygon:

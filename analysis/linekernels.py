@@ -1,14 +1,13 @@
 # pyright: reportPrivateImportUsage=false, reportUnknownMemberType=false, reportMissingTypeStubs=false
 # numba's intrinsics are untyped; `_trailing_zeros` and `_ones` below are the only ones.
-"""Compiled lines across a shape, 64 at a time: random numbers, directions, crossings, 𝓛_1 and 𝓛_3.
+"""Compiled lines across a shape, 64 at a time: crossings, 𝓛_1 and 𝓛_3.
 
 A line n·v = p meets an edge when the sign of n·v − p changes between its ends. The signs at 64 successive vertices
 make one machine word for each line: the loop over vertices is the outer one, that over lines the inner one, which
 the compiler turns into vector instructions. A word XORed with itself, shifted by one, has a bit for every edge that
 is met, and only those few edges are looked at again. No crossing is ever dropped: there is room for all edges.
 
-Random numbers are those of `numpy.random.SFC64` (C. Doty-Humphrey), one generator for each of the 64 lines, inlined
-because a call costs more than the number. No fast-math anywhere: equal seeds give equal bits on every machine.
+The lines are those of `analysis.lanes`. No fast-math anywhere: equal seeds give equal bits on every machine.
 """
 
 from __future__ import annotations
@@ -21,20 +20,17 @@ from llvmlite import ir
 from numpy.typing import NDArray
 
 from analysis.kernels import chord_invariants, kernel
+from analysis.lanes import LANES, directions, draw
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Words = NDArray[np.uint64]
 
-LANES = 64
 WORD_EDGES = 63  # 64 vertices to a word, the last of which opens the next
-_WARM_UP = 12  # rounds after seeding, as NumPy does
 _INTERLEAVED = 16  # up to so many crossings are sorted without branches
 
 _ZERO, _ONE = np.uint64(0), np.uint64(1)
-_S11, _S3, _S24, _S40 = np.uint64(11), np.uint64(3), np.uint64(24), np.uint64(40)
 _BIT1, _BIT2, _BIT3 = np.uint64(2), np.uint64(4), np.uint64(8)
-_TO_UNIT = 2.0**-53
 
 
 class Outline(NamedTuple):
@@ -124,16 +120,6 @@ def work_for(outline: Outline) -> Work:
     )
 
 
-def seeded(stream: np.random.Generator) -> Words:
-    """State (4, 64) of one SFC64 for each of the 64 lines: three words drawn from ``stream`` each, and the counter."""
-    state = np.ones((4, LANES), dtype=np.uint64)
-    state[:3] = stream.integers(0, 1 << 64, (3, LANES), dtype=np.uint64)
-    drop = np.empty(LANES)
-    for _ in range(_WARM_UP):
-        draw(state, drop)
-    return state
-
-
 @cast(Any, numba).extending.intrinsic
 def _trailing_zeros(_context: Any, word: Any) -> Any:
     def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
@@ -148,40 +134,6 @@ def _ones(_context: Any, word: Any) -> Any:
         return builder.ctpop(arguments[0])
 
     return word(word), generate
-
-
-@kernel
-def draw(state: Words, uniform: Floats) -> None:
-    """Draw the next number in [0, 1) of every lane's SFC64, with 53 bits, as NumPy's ``random()`` does."""
-    a, b, c, counter = state[0], state[1], state[2], state[3]
-    for i in range(LANES):
-        new = a[i] + b[i] + counter[i]
-        counter[i] += _ONE
-        a[i] = b[i] ^ (b[i] >> _S11)
-        b[i] = c[i] + (c[i] << _S3)
-        c[i] = ((c[i] << _S24) | (c[i] >> _S40)) + new
-        uniform[i] = np.float64(np.int64(new >> _S11)) * _TO_UNIT
-
-
-@kernel
-def directions(uniform: Floats, cos: Floats, sin: Floats) -> None:
-    """Turn uniform numbers into normals: θ from −π/4 to π/4, and for the upper half of them a quarter turn on.
-
-    The Taylor series are complete to double precision within ±π/4, and have no branches.
-    """
-    for i in range(LANES):
-        twice = 2.0 * uniform[i]
-        upper = twice >= 1.0
-        x = (np.pi / 2) * ((twice - 1.0 if upper else twice) - 0.5)
-        q = x * x
-        s = 1.0 / 6227020800 - q * (1.0 / 1307674368000)
-        s = 1.0 / 362880 - q * (1.0 / 39916800 - q * s)
-        s = x * (1.0 - q * (1.0 / 6 - q * (1.0 / 120 - q * (1.0 / 5040 - q * s))))
-        c = 1.0 / 479001600 - q * (1.0 / 87178291200 - q * (1.0 / 20922789888000))
-        c = 1.0 / 720 - q * (1.0 / 40320 - q * (1.0 / 3628800 - q * c))
-        c = 1.0 - q * (0.5 - q * (1.0 / 24 - q * c))
-        cos[i] = -s if upper else c
-        sin[i] = c if upper else s
 
 
 @kernel

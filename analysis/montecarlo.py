@@ -17,9 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from analysis.blocks import Progress, run_blocks
 from analysis.boundary import Boundary, Geometry
-from analysis.invariants import area_cm2, perimeter_cm
+from analysis.invariants import sizes
 from analysis.kernels import available_cores, ragged_invariants, ragged_moments
-from analysis.linekernels import LANES, cross_given, fill_crossings, fill_lines, seeded, sum_lines, work_for
+from analysis.lanes import LANES, seeded
+from analysis.linekernels import cross_given, fill_crossings, fill_lines, sum_lines, work_for
 from lab.base.errors import RequestError
 
 __all__ = [
@@ -150,8 +151,8 @@ def simulate(
     start = perf_counter()
     sums = _segment_sums(boundary, np.full(runs, lines, dtype=np.int64), rng, progress, threads)
     elapsed_s = perf_counter() - start
-    k, l1, l3 = (sums / lines).T
-    return Simulation(lines, area_cm2(l1, l3), perimeter_cm(k, l1, l3), lines * runs / elapsed_s)
+    area, perimeter = sizes(sums / lines).T
+    return Simulation(lines, area, perimeter, lines * runs / elapsed_s)
 
 
 def simulate_lines(
@@ -234,8 +235,7 @@ def running_bands(
     _at_least_one(runs=runs)
     segments = np.tile(np.diff(n, prepend=0), runs)
     sums = _segment_sums(Boundary.of(geometry), segments, rng, progress, threads).reshape(runs, n.size, 3)
-    k, l1, l3 = np.moveaxis(np.cumsum(sums, axis=1) / n[:, None], 2, 0)
-    area, perimeter = area_cm2(l1, l3), perimeter_cm(k, l1, l3)
+    area, perimeter = np.ascontiguousarray(np.moveaxis(sizes(np.cumsum(sums, axis=1) / n[:, None]), 2, 0))
     levels = np.asarray(quantiles, dtype=float).ravel()
     spread = 1 if runs > 1 else 0
     return Bands(

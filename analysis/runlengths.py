@@ -24,7 +24,7 @@ from analysis.billiard import check_exponent, hit_and_run, roll
 from analysis.boundary import Boundary, Geometry
 from analysis.invariants import sizes
 from analysis.montecarlo import cross_lines
-from analysis.turninglaw import Exponent, LawTable, tabulate_law
+from analysis.turninglaw import Exponent, LawTable, as_measured, tabulate_law
 from lab.base.errors import RequestError
 from lab.base.jackknife import jackknife_sigma
 
@@ -142,6 +142,8 @@ def tabulate_runs(
 ) -> RunTable:
     """Simulate sessions of ``runs`` runs by Lambert's law in the arena, and by the laws around it for the fit.
 
+    Their lengths are those of robots whose scale is known to 1 % (`analysis.turninglaw.as_measured`).
+
     Args:
         reachable: convex polygon in which the robot's centre moves, cm.
         runs: edge-to-edge runs in each session.
@@ -158,7 +160,8 @@ def tabulate_runs(
     at_once = max(1, _ROLLED_AT_ONCE // runs)
     throw = hit_and_run if length_weighted else roll
     parts = [
-        throw(reachable, min(at_once, sessions - begun), runs, rng).length_cm for begun in range(0, sessions, at_once)
+        as_measured(throw(reachable, min(at_once, sessions - begun), runs, rng).length_cm, rng)
+        for begun in range(0, sessions, at_once)
     ]
     pool = np.sort(np.concatenate([part.ravel() for part in parts]))
     expected_cm = float(pool.mean()) if length_weighted else np.pi * reachable.area / reachable.length
@@ -217,7 +220,7 @@ def examine_runs(
     )
     if not length_weighted:
         verdict += (
-            f" Their lengths fit outgoing angles of density ∝ cos^m with m = {exponent.value:.2f} "
+            f" Their lengths fit outgoing angles of density ∝ cosᵐ φ with m = {exponent.value:.2f} "
             f"({exponent.low:.2f} to {exponent.high:.2f} at 95 %), where 1 is Lambert's law and 0 a uniform angle."
         )
     if not passed:
@@ -272,7 +275,7 @@ def expected_bias(
     truth = np.array([geometry.area, geometry.length])
     bias, error = (size / truth - 1).tolist(), (sigma / truth).tolist()
     verdict = (
-        f"Outgoing angles of density ∝ cos^{exponent:.2f} in this arena bias this shape's area by "
+        f"Outgoing angles of density ∝ cosᵐ φ, m = {exponent:.2f}, in this arena bias this shape's area by "
         f"{100 * bias[0]:+.1f} ± {100 * error[0]:.1f} % and its perimeter by "
         f"{100 * bias[1]:+.1f} ± {100 * error[1]:.1f} %."
     )

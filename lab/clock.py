@@ -22,6 +22,7 @@ T = TypeVar("T")
 _SHORTEST_WAIT_S = 0.005  # a selector waits whole milliseconds; a shorter wait is made up for by the next
 _LATE_S = 0.1
 _FROZEN_TURN_S = 1.0
+_ONE_TURN_S = 1e-9
 
 
 class Pace:
@@ -96,8 +97,18 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
     def __init__(self, start_s: float = 0.0, pace: Pace | None = None) -> None:
         self._jumping = _JumpingSelector(start_s, pace or Pace())
         super().__init__(self._jumping)
-        # Two timers closer than this run in one turn, so that rounding never makes a turn that waits for 1e-16 s.
-        self._clock_resolution = 1e-9
+
+    @property
+    def _clock_resolution(self) -> float:
+        """Timers before now and this run in one turn, says asyncio.
+
+        Rounding must never make a turn that waits for 1e-16 s; beyond 1e7 s a double's step is longer than 1e-9 s.
+        """
+        return max(_ONE_TURN_S, math.ulp(self.time()))
+
+    @_clock_resolution.setter
+    def _clock_resolution(self, _: float) -> None:
+        """What asyncio sets is the monotonic clock's."""
 
     def time(self) -> float:
         """Virtual seconds; ``start_s`` when the loop was made."""

@@ -151,7 +151,7 @@ def fit_projector(
             f"{len(points)} points of the projected picture were seen, and {FEWEST_POINTS} that are not on one line "
             "are needed: let the camera see more of it, in a darker room"
         )
-    start = _start(points, seen, image_size, beforehand)
+    start = _start(points, seen, beforehand)
     cm_per_px = beforehand.centre_cm[2] / beforehand.focal_px
     noise_px = 0.5 if error_cm is None else max(error_cm / cm_per_px, _FINEST_PX)
     fitted, covariance = _solve(start, points, seen, image_size, beforehand, noise_px)
@@ -197,7 +197,7 @@ def _pinhole(parameters: Floats, image_size: tuple[int, int]) -> Pinhole:
     )
 
 
-def _start(points: Floats, seen: Floats, image_size: tuple[int, int], beforehand: Beforehand) -> Floats:
+def _start(points: Floats, seen: Floats, beforehand: Beforehand) -> Floats:
     """A first pose from the picture of the lowest plane, through the lens as it is known beforehand.
 
     A homography K (r1 r2 t) holds two columns of the rotation and the way to the plane (Zhang 2000).

@@ -8,34 +8,14 @@ that it would have then.
 
 from __future__ import annotations
 
-import string
 from collections.abc import Iterable
 from pathlib import Path
 
 from lab.base.errors import ChordlabError, RequestError
+from projector.catalogue import COLLECTIONS, DRAWN, LETTERS, PAPER, drawn_files, shapes_folder
 from projector.geojson import read_shape
 from projector.shape import Font, Shape
 from projector.text import Typeface, find_font
-
-PAPER = "paper"
-DRAWN = (PAPER, "monuments")
-COLLECTIONS = (*DRAWN, "letters", "words", "all")
-LETTERS = string.ascii_uppercase + string.digits
-
-
-def shapes_folder() -> Path:
-    """The folder of the dictionary's files: beside this module when installed, else the checkout's."""
-    here = Path(__file__).resolve().parent
-    for folder in (here / "shapes", here.parent / "data" / "shapes"):
-        if folder.is_dir():
-            return folder
-    raise ChordlabError("the dictionary's shapes are missing from this installation; install chordlab again")
-
-
-def drawn_files(collection: str) -> dict[str, Path]:
-    """The GeoJSON files of ``paper`` or ``monuments``, by the shapes' names."""
-    folder = shapes_folder() if collection == PAPER else shapes_folder() / collection
-    return {path.stem: path for path in sorted(folder.glob("*.geojson"))}
 
 
 def charter_words() -> list[str]:

@@ -6,21 +6,23 @@ import asyncio
 import contextlib
 import logging
 import math
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 from bleak.backends.client import BaseBleakClient
 from bleak.backends.scanner import BaseBleakScanner
 
-from robot import commands, status
+from robot import commands, preparing, status
 from robot.backoff import persist
 from robot.collision import wall_normal_heading
 from robot.commands import BatteryState, ChargerState, Collision, Colour, Request
 from robot.device import Attitude, Bump, Identity, Sample
+from robot.errands import Errands
 from robot.errors import CommandError, DriveError, LinkLostError, PayloadError, ReplyTimeoutError, RobotError
 from robot.link import Heard, Link, scan
 from robot.packets import Packet
+from robot.preparing import MOTORS_OFF, STABILISED
 from robot.profile import RobotProfile
 from robot.stream import OFF, Stream
 from robot.tending import Tending
@@ -31,15 +33,11 @@ _log = logging.getLogger(__name__)
 
 _SENSOR_DATA = commands.SENSOR_DATA.key
 _COLLISION = commands.COLLISION.key
-_COLLISION_METHOD = 1
 _FAREWELL_TIMEOUT_S = 2.0
-_HALT_TIMEOUT_S = 1.0
 # Braking and half a turn on the spot take about a second.
 _AIM_S = 2.0
 _AIMING: Colour = (0, 0, 255)
 _DARK: Colour = (0, 0, 0)
-_STABILISED = Request(commands.STABILISATION, commands.STABILISATION.payload(commands.STABILISE_FULL))
-_MOTORS_OFF = commands.raw_motors(0, 0)
 _UNSTABILISED = Request(commands.STABILISATION, commands.STABILISATION.payload(commands.STABILISE_NONE))
 
 
@@ -87,7 +85,7 @@ class Bolt:
         self._raw: Request | None = None
         self._stream: Stream | None = None
         self._led: tuple[float, tuple[float, float, float]] | None = None
-        self._errands: set[asyncio.Task[None]] = set()
+        self._errands = Errands()
         self._now_s: Callable[[], float] = float
 
     async def __aenter__(self) -> Self:
@@ -148,7 +146,7 @@ class Bolt:
         """Connect and set the robot up; with ``again``, stop it first and take up what it did before."""
         self._now_s = asyncio.get_running_loop().time
         # The link before may still be closing.
-        await self._settle()
+        await self._errands.settle(_FAREWELL_TIMEOUT_S)
         try:
             self._check(self._wanted, "it was let go meanwhile")
             await self._link.open()
@@ -179,28 +177,19 @@ class Bolt:
             raise LinkLostError(self.name, otherwise)
 
     async def _halt(self) -> None:
-        """Come to rest, without the patience for a robot that is known to listen."""
-        if self._raw is not None:
-            await self._link.ask(_MOTORS_OFF, timeout_s=_HALT_TIMEOUT_S)
-        await self._link.ask(commands.drive(0, self._heading_rad), timeout_s=_HALT_TIMEOUT_S)
+        await preparing.halt(self._link, self._heading_rad, raw=self._raw is not None)
 
     async def _set_up(self) -> None:
-        """Bring a robot that is awake into the state that this driver counts on."""
-        await self._link.ask(OFF)
-        await self._link.ask(_STABILISED)
+        await preparing.balance(self._link)
         self._raw = None
-        # 0: the locator's y axis stays along heading 0 when the yaw is reset, now and by ``aim``.
-        await self._link.ask(Request(commands.LOCATOR_FLAGS, commands.LOCATOR_FLAGS.payload(0)))
         await self._take_frame()
-        threshold = self.profile.collision_threshold
-        thresholds = (threshold, threshold, threshold, threshold)
-        await self._link.ask(commands.collision_setup(_COLLISION_METHOD, thresholds, self.profile.collision_dead_s))
+        await preparing.feel_bumps(self._link, self.profile)
 
     async def _take_frame(self) -> None:
         """Make where the robot stands and faces its frame."""
-        await self._link.ask(Request(commands.RESET_YAW))
+        await preparing.reset_yaw(self._link)
         self._heading_rad = self._facing_rad = 0.0
-        await self._link.ask(Request(commands.RESET_LOCATOR))
+        await preparing.reset_locator(self._link)
 
     async def disconnect(self) -> None:
         """Stop the robot, dark its matrix, and let it go. Does nothing when it is not connected."""
@@ -219,7 +208,7 @@ class Bolt:
         finally:
             self._tending.dismiss()
             await self._link.close()
-            await self._settle()
+            await self._errands.settle(_FAREWELL_TIMEOUT_S)
 
     async def identity(self) -> Identity:
         """Name, address, firmware and battery."""
@@ -255,7 +244,7 @@ class Bolt:
     async def _roll(self, heading_rad: float, speed_units: int) -> None:
         request, raw = commands.drive(speed_units, heading_rad), self._raw
         self._heading_rad = heading_rad
-        before = () if raw is None else (_MOTORS_OFF, _STABILISED)
+        before = () if raw is None else (MOTORS_OFF, STABILISED)
         if await self._tending.move(request, lasts=speed_units > 0, before=before):
             # Only now: a bump reported before this came from the heading before.
             self._facing_rad = math.radians(round(math.degrees(heading_rad)) % 360)
@@ -365,7 +354,7 @@ class Bolt:
             elif key == _COLLISION:
                 self._bumped(Collision.decode(packet.data))
             elif key == commands.WILL_SLEEP.key:
-                self._spawn(self._ping())
+                self._errands.start(self._ping())
             elif key == commands.DID_SLEEP.key:
                 self._link.fail("it fell asleep")
         except PayloadError as error:
@@ -389,7 +378,7 @@ class Bolt:
             self.on_bump(Bump(self._now_s(), normal_rad))
 
     def _lost(self, reason: str) -> None:
-        self._spawn(self._link.close())
+        self._errands.start(self._link.close())
         # A link that breaks while it is being set up fails ``connect`` instead.
         if self._tending.dismiss():
             if self.on_lost is not None:
@@ -402,16 +391,3 @@ class Bolt:
             await self._link.ask(Request(commands.PING))
         except RobotError as error:
             self._link.fail(str(error))
-
-    def _spawn(self, errand: Coroutine[Any, Any, None]) -> None:
-        """Run ``errand`` on the side, held until it is done."""
-        task = asyncio.get_running_loop().create_task(errand)
-        self._errands.add(task)
-        task.add_done_callback(self._errands.discard)
-
-    async def _settle(self) -> None:
-        """Let the errands of the connection before end, and end those that are late."""
-        if self._errands:
-            _, late = await asyncio.wait(self._errands, timeout=_FAREWELL_TIMEOUT_S)
-            for errand in late:
-                errand.cancel()

@@ -1,7 +1,7 @@
 """Finds out what no source states of a robot: rolls it about, flips the light over it, and watches what it says.
 
-The steps take a ``Trial`` and callables for the world around it. What they find are ``Finding``s, one for a key of
-the ``RobotProfile``. The arithmetic is in ``robot.fitting``.
+The steps take a ``Trial`` and callables for the world around it. What they find are ``Finding``s
+(``robot.finding``), one for a key of the ``RobotProfile``. The arithmetic is in ``robot.fitting``.
 
 The robot starts in mid-arena and need not be told where that is: a run that meets a wall is turned round and
 repeated.
@@ -11,17 +11,16 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from robot.crossings import LevelsError, learn_levels
 from robot.device import Bump
 from robot.errors import RobotError
+from robot.finding import Finding, applied, comments_of
 from robot.fitting import TURN, AxesFound, Figure, Hit, WallSeen, axes_of, latency_of, mean_of, onset_s, wall_through
-from robot.profile import RobotProfile
 from robot.trial import FINEST_S, GIVE_UP_S, MOVED_CM, CharacteriseError, Roll, Trial, neutral
 
 __all__ = [
@@ -62,52 +61,6 @@ _BACK_CM = 16.0
 _OBLIQUE_RAD, _HEAD_ON = 0.6, 2
 _STRAY_CM, _LEAST_RADIUS_CM = 1.0, 30.0  # beyond these it is a corner, or something that is no wall
 _FARTHER = 2.2  # than where it set out from the wall: what is met there is another wall
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One value of the profile, as measured; ``value`` None where it was not, and ``how`` then says why.
-
-    ``error`` is one standard error, or half the resolution of a value found by steps; None for what is exact.
-    """
-
-    key: str
-    value: float | int | tuple[str, str] | None
-    error: float | None
-    n: int
-    how: str
-
-    @property
-    def comment(self) -> str:
-        """What the profile file says behind the value."""
-        if self.value is None:
-            return f"not measured: {self.how}"
-        error = "" if self.error is None or not math.isfinite(self.error) else f" ± {self.error:.2g},"
-        return f"measured: {self.how};{error} n = {self.n}"
-
-    @property
-    def number(self) -> float:
-        """The value of one that is a number; NaN where it was not measured."""
-        return float(self.value) if isinstance(self.value, (int, float)) else math.nan
-
-    @classmethod
-    def of(cls, key: str, figure: Figure, how: str) -> Finding:
-        """A finding from a figure; not measured where the figure is NaN."""
-        if not math.isfinite(figure.value):
-            return cls(key, None, None, 0, f"too little was seen for it ({how})")
-        # Six digits are more than any of these is good to, and can be read.
-        return cls(key, float(f"{figure.value:.6g}"), figure.error, figure.n, how)
-
-
-def applied(profile: RobotProfile, findings: Sequence[Finding]) -> RobotProfile:
-    """``profile`` with the measured values put in; what was not measured stays."""
-    measured: dict[str, Any] = {finding.key: finding.value for finding in findings if finding.value is not None}
-    return replace(profile, **measured)
-
-
-def comments_of(findings: Sequence[Finding]) -> Mapping[str, str]:
-    """For ``save_profile``: how each value was measured."""
-    return {finding.key: finding.comment for finding in findings}
 
 
 async def least_interval(trial: Trial) -> Finding:

@@ -48,7 +48,7 @@ Pure Python on ``math``, ``array`` and ``robot.onboard`` alone, and so fit for a
 import math
 from array import array
 
-from robot.onboard import Precision
+from robot.onboard import Precision, take_line, take_lines
 
 _NAN = float("nan")
 # Of a line: crossings, L1, L3, cuts.
@@ -252,23 +252,13 @@ class InterruptedEstimator(Precision):
         self._total_l4 += self._l4
         # A cut shows twice, by where a line ends and by where the next begins; halved between the two, each
         # with the pairs that it lost by it, the standard errors come out right.
-        self._take((float(self._n), self._l1, self._l3, 0.5 * (self._began_lit + cut)))
+        line = (float(self._n), self._l1, self._l3, 0.5 * (self._began_lit + cut))
+        take_line(line, self.runs, self._means, self._comoments, _SIZE)
         return self._n, self._l1, self._l3
 
     def drop_line(self) -> None:
         """Forget the line in progress, as if it had never been; harmless when there is none."""
         self._rolling = False  # start_line clears what it had gathered
-
-    def _take(self, line: tuple[float, ...]) -> None:
-        """Welford's recursion."""
-        before = [line[i] - self._means[i] for i in range(_SIZE)]
-        for i in range(_SIZE):
-            self._means[i] += before[i] / self.runs
-        at = 0
-        for i in range(_SIZE):
-            for j in range(i, _SIZE):
-                self._comoments[at] += before[i] * (line[j] - self._means[j])
-                at += 1
 
     def merge(self, other: "InterruptedEstimator") -> None:
         """Take in the lines of another robot in the same light; ``other`` is left as it was.
@@ -280,17 +270,8 @@ class InterruptedEstimator(Precision):
             raise ValueError("sums under different paths per cut cannot be merged: count both with a common one")
         if other.runs == 0:
             return
-        both = self.runs + other.runs
-        apart = [other._means[i] - self._means[i] for i in range(_SIZE)]
-        weight = self.runs * other.runs / both
-        at = 0
-        for i in range(_SIZE):
-            for j in range(i, _SIZE):
-                self._comoments[at] += other._comoments[at] + weight * apart[i] * apart[j]
-                at += 1
-        for i in range(_SIZE):
-            self._means[i] += apart[i] * other.runs / both
-        self.runs = both
+        take_lines(self.runs, self._means, self._comoments, other.runs, other._means, other._comoments, _SIZE)
+        self.runs += other.runs
         self.lines += other.lines
         self.crossings += other.crossings
         self.cuts += other.cuts

@@ -37,6 +37,60 @@ def _check_weight(weight: float) -> None:
         raise ValueError("a line's weight must be a finite number above 0: check the turning policy")
 
 
+def take_line(
+    line: "list[float] | tuple[float, ...]",
+    lines: int,
+    means: "array[float]",
+    comoments: "array[float] | None",
+    size: int,
+) -> None:
+    """Take one more line, the ``lines``-th, into means and co-moments: Welford's recursion.
+
+    Args:
+        line: Its values.
+        lines: Their number with it.
+        means: Of all values; changed in place.
+        comoments: Sums of products of deviations of the first ``size`` values from their means, the upper triangle by
+            rows; changed in place. None where they are not kept.
+        size: How many values have them.
+    """
+    before = [line[i] - means[i] for i in range(len(line))]
+    for i in range(len(line)):
+        means[i] += before[i] / lines
+    if comoments is not None:
+        at = 0
+        for i in range(size):
+            for j in range(i, size):
+                comoments[at] += before[i] * (line[j] - means[j])
+                at += 1
+
+
+def take_lines(
+    lines: int,
+    means: "array[float]",
+    comoments: "array[float] | None",
+    more: int,
+    means_more: "array[float]",
+    comoments_more: "array[float] | None",
+    size: int,
+) -> None:
+    """Take ``more`` lines into means and co-moments of ``lines``, as in `take_line`; what is added is left as it was.
+
+    The parallel form of Welford's recursion (Chan, Golub and LeVeque 1979).
+    """
+    both = lines + more
+    apart = [means_more[i] - means[i] for i in range(len(means))]
+    if comoments is not None and comoments_more is not None:
+        weight = lines * more / both
+        at = 0
+        for i in range(size):
+            for j in range(i, size):
+                comoments[at] += comoments_more[at] + weight * apart[i] * apart[j]
+                at += 1
+    for i in range(len(apart)):
+        means[i] += apart[i] * more / both
+
+
 class Precision:
     """Standard errors of an estimate, from its ``covariance()``."""
 
@@ -227,7 +281,7 @@ class Estimator(Precision):
         l4_cm4: float | None = None,
         l5_cm5: float | None = None,
     ) -> None:
-        """Take a finished line into the session: the running means and Welford's co-moments.
+        """Take a finished line into the session: the running means and co-moments.
 
         ``end_line`` calls this; a resumed session calls it with the lines it has stored.
 
@@ -246,24 +300,14 @@ class Estimator(Precision):
             return
         self.lines += 1
         self.chords += k
-        means = self._means
-        before = [line[i] - means[i] for i in range(len(line))]
-        for i in range(len(line)):
-            means[i] += before[i] / self.lines
-        if self._comoments is not None:
-            at = 0
-            for i in range(3):
-                for j in range(i, 3):
-                    self._comoments[at] += before[i] * (line[j] - means[j])
-                    at += 1
+        take_line(line, self.lines, self._means, self._comoments, 3)
 
     def merge(self, other: "Estimator") -> None:
         """Take in the lines of another robot in the same light: sufficient statistics, never estimates.
 
-        The parallel form of Welford's recursion (Chan, Golub and LeVeque 1979). A session without
-        covariance, or without the higher invariants, on either side ends without. ``other`` is left as it was.
+        A session without covariance, or without the higher invariants, on either side ends without. ``other`` is
+        left as it was.
         """
-        both = self.lines + other.lines
         self.runs += other.runs
         if other._comoments is None:
             self._comoments = None
@@ -272,17 +316,8 @@ class Estimator(Precision):
             self._means = array("d", [self._means[0], self._means[1], self._means[2]])
         if other.lines == 0:
             return
-        apart = [other._means[i] - self._means[i] for i in range(len(self._means))]
-        if self._comoments is not None and other._comoments is not None:
-            weight = self.lines * other.lines / both
-            at = 0
-            for i in range(3):
-                for j in range(i, 3):
-                    self._comoments[at] += other._comoments[at] + weight * apart[i] * apart[j]
-                    at += 1
-        for i in range(len(apart)):
-            self._means[i] += apart[i] * other.lines / both
-        self.lines = both
+        take_lines(self.lines, self._means, self._comoments, other.lines, other._means, other._comoments, 3)
+        self.lines += other.lines
         self.chords += other.chords
 
     def means(self) -> tuple[float, float, float]:

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from lab.base.timeline import Timeline, sleep_until
 from robot.device import Bump, Identity, Sample
-from robot.edge import EdgePoint, FeltEdge
+from robot.edge import EdgePoint
 from robot.errors import NotConnectedError, ReconnectError, RobotError
+from robot.feeledge import FeltEdge
 
 _LONGEST_STOP_S = 10.0  # whoever stops a robot gives up soon after
 

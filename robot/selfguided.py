@@ -22,6 +22,7 @@ from bleak.exc import BleakBluetoothNotAvailableError, BleakError
 from lab.base.errors import RequestError
 from robot.crossings import Levels
 from robot.device import Identity
+from robot.errands import Errands
 from robot.errors import (
     BluetoothUnavailableError,
     DriveError,
@@ -127,7 +128,7 @@ class SelfGuided:
         self._heard_s = 0.0
         self._waiting: set[asyncio.Future[_Status]] = set()
         self._watcher: asyncio.Task[None] | None = None
-        self._errands: set[asyncio.Task[None]] = set()
+        self._errands = Errands()
 
     @property
     def rolling(self) -> bool:
@@ -184,10 +185,7 @@ class SelfGuided:
         self._forget("it was let go")
         if client is not None:
             await self._let_go(client)
-        if self._errands:
-            _, late = await asyncio.wait(self._errands, timeout=_CLOSE_TIMEOUT_S)
-            for errand in late:
-                errand.cancel()
+        await self._errands.settle(_CLOSE_TIMEOUT_S)
 
     async def identity(self) -> Identity:
         """Name, address, the program's version and the battery (0 V where the robot does not measure it)."""
@@ -371,9 +369,7 @@ class SelfGuided:
             return
         self._rolling = False
         self._forget(reason)
-        errand = asyncio.get_running_loop().create_task(self._let_go(client))
-        self._errands.add(errand)
-        errand.add_done_callback(self._errands.discard)
+        self._errands.start(self._let_go(client))
         if self.on_lost is not None:
             self.on_lost(reason)
         else:

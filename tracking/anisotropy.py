@@ -16,7 +16,7 @@ Vlasov, arXiv:0711.4734) this gives what A = (pi/3) <L3>/<L1> and P = pi A <k>/<
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import shapely
@@ -30,9 +30,6 @@ from lab.base.jackknife import jackknife_sigma
 from tracking.linespace import LineSpace, support
 from tracking.nulltable import CENTRE_PULL, SMOOTH, NullTable
 from tracking.uniformity import smooth_functions, smooth_terms
-
-if TYPE_CHECKING:
-    from tracking.isotropy import IsotropyReport
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -248,7 +245,7 @@ def _left_out(functions: Floats, hit: Bools) -> Floats:
     return (sums.sum(axis=0) - sums) / np.maximum(hits.sum() - hits, 1.0)[:, None]
 
 
-def bias_from(report: IsotropyReport, region: Polygon, shape: Polygon | MultiPolygon) -> ShapeBias:
+def bias_from(evidence: Evidence, region: Polygon, shape: Polygon | MultiPolygon) -> ShapeBias:
     """Predict from a session's lines alone what their density does to area and perimeter of a shape.
 
     The lines are a sample, and so is the prediction: with few lines its error is about that of the estimates
@@ -256,7 +253,7 @@ def bias_from(report: IsotropyReport, region: Polygon, shape: Polygon | MultiPol
     error shrinks.
 
     Args:
-        report: from `tracking.isotropy.examine_lines`.
+        evidence: of the report by `tracking.isotropy.examine_lines`.
         region: convex polygon in which the ball's centre moves, cm, as it was given there.
         shape: the projected shape, cm; what lies outside the region no line meets.
 
@@ -271,7 +268,6 @@ def bias_from(report: IsotropyReport, region: Polygon, shape: Polygon | MultiPol
     hull = shapely.convex_hull(lit)
     if not isinstance(hull, Polygon):  # the hull of nothing is none
         raise RequestError("the shape has no area within the region that the robot can reach; move or enlarge it")
-    evidence = report.evidence
     u, v = LineSpace.of(hull).uniforms(evidence.theta_rad, evidence.p_cm)
     hit = (v > 0.0) & (v < 1.0)
     if int(hit.sum()) < _FEWEST_HITS:

@@ -12,7 +12,8 @@ from copy import copy
 import numpy as np
 from numpy.typing import NDArray
 
-from tracking.spot import SHELL_SIZE, Evidence, Shell
+from tracking.spot import Evidence, Shell
+from tracking.spotkernels import SHELL_SIZE
 
 Floats = NDArray[np.float64]
 

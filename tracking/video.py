@@ -319,7 +319,11 @@ def _open(path: Path) -> tuple[InputContainer, VideoStream]:
     if not container.streams.video:
         container.close()
         raise VideoError(path, f"{path}: holds no video stream (sound only?); give the file with the picture")
-    return container, container.streams.video[0]
+    stream = container.streams.video[0]
+    if cast("object", stream.codec_context) is None:  # by chance, what is no video begins as one
+        container.close()
+        raise VideoError(path, f"{path}: cannot be read as a video (unknown codec); give a video, or copy it again")
+    return container, stream
 
 
 def _info(path: Path, container: InputContainer, stream: VideoStream) -> VideoInfo:

@@ -1,18 +1,15 @@
 # pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
 # (matplotlib's stubs leave every **kwargs untyped)
-"""Many sessions in one picture: small multiples of A and P, pulls, recognition, p-values, health over time."""
+"""Many sessions in one picture: small multiples of A and P, pulls, recognition, p-values."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure
-from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.path import Path as MplPath
 from matplotlib.ticker import FixedLocator, FormatStrFormatter, NullLocator
 from numpy.typing import NDArray
@@ -21,7 +18,7 @@ from scipy.stats import norm
 from analysis.estimate import ellipse
 from analysis.figures import pen
 from analysis.figures.fields import paint
-from analysis.figures.style import colour_of
+from analysis.figures.style import AREA, MANY_DOTS, PERIMETER, colour_of, fitting
 from analysis.pulls import Pull, Share, uniform_band
 
 Floats = NDArray[np.float64]
@@ -31,10 +28,8 @@ LEVEL = 0.95
 _WIDTH_IN = 7.2
 _WIDTHS_IN = {1: 4.2, 2: 6.2, 3: _WIDTH_IN}  # by columns of small multiples
 _TICKS = ((1.0, 2.0, 5.0), (1.0, 1.5, 2.0, 3.0, 5.0, 7.0))  # in each decade; the finer where the coarse are too few
-_MANY = 400  # dots; more are drawn as pixels
 _WIDEST_Z = 5.0
 _FARTHEST = 6.0  # σ of the session with the fewest lines, beyond which an error is drawn at the rim
-_AREA, _PERIMETER = "#0b7bc1", "#d97a00"  # Okabe and Ito's pair: told apart by all eyes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,7 +73,7 @@ def clouds_figure(clouds: Sequence[Cloud]) -> Figure:
     for index, cloud in enumerate(clouds):
         axes = figure.add_subplot(rows, columns, index + 1)
         first = index % columns == 0
-        pen.dress(axes, x="P (cm)", y="A (cm²)" if first else "", title=_short(cloud.name, 26))
+        pen.dress(axes, x="P (cm)", y="A (cm²)" if first else "", title=fitting(cloud.name, 26))
         _cloud(axes, cloud)
     last = figure.axes[-1]
     pen.dots(last, [], [], pen.MUTED, size=16, label="session")
@@ -115,7 +110,7 @@ def _cloud(axes: Axes, cloud: Cloud) -> None:
     inside = cloud.inside()
     size = float(np.clip(900 / max(inside.size, 1), 4.0, 16.0))
     p, a = cloud.perimeter_cm, cloud.area_cm2
-    pixels = inside.size > _MANY
+    pixels = inside.size > MANY_DOTS
     pen.dots(axes, p[inside], a[inside], colour, size=size, alpha=0.75, pixels=pixels, gid=f"inside {cloud.name}")
     pen.dots(
         axes,
@@ -166,7 +161,7 @@ def errors_figure(shapes: Sequence[Errors]) -> Figure:
                 axes,
                 x="crossing lines N" if row else "",
                 y=f"error of {symbol} (%)" if column == 0 else "",
-                title="" if row else _short(shape.name, 26),
+                title="" if row else fitting(shape.name, 26),
             )
             _errors(axes, shape, 100 * errors, 100 * sigma, symbol)
     axes = figure.axes[-1]
@@ -192,7 +187,7 @@ def _errors(axes: Axes, shape: Errors, percent: Floats, sigma: float, symbol: st
     pen.level(axes, 0.0, pen.MUTED, width=0.8, style="-")
     beyond = np.abs(percent) > farthest
     size = float(np.clip(900 / max(lines.size, 1), 4.0, 14.0))
-    pixels = lines.size > _MANY
+    pixels = lines.size > MANY_DOTS
     gid = f"{symbol} {shape.name}"
     pen.dots(axes, lines[~beyond], percent[~beyond], colour, size=size, alpha=0.8, pixels=pixels, gid=gid)
     for up, marker in ((True, "^"), (False, "v")):
@@ -225,7 +220,7 @@ def pulls_figure(area_z: Floats, perimeter_z: Floats, *, area: Pull, perimeter: 
     figure = pen.new_figure(_WIDTH_IN, 2.9)
     first: Axes | None = None
     for column, (title, z, pull, colour) in enumerate(
-        (("area A", area_z, area, _AREA), ("perimeter P", perimeter_z, perimeter, _PERIMETER)), start=1
+        (("area A", area_z, area, AREA), ("perimeter P", perimeter_z, perimeter, PERIMETER)), start=1
     ):
         axes = figure.add_subplot(1, 2, column, sharey=first)
         first = axes
@@ -256,16 +251,16 @@ def recognition_figure(shares: Mapping[str, Share], named: Mapping[str, Mapping[
     )
     confused = len(shares) > 1 or len(answers) > 1
     height = 1.5 + 0.27 * len(shares)
-    longest = max((len(_short(name, 18)) for name in answers), default=0)
+    longest = max((len(fitting(name, 18)) for name in answers), default=0)
     figure = pen.new_figure(_WIDTH_IN, height + (0.06 * longest if confused else 0.0))
     if confused:
         grid = figure.add_gridspec(1, 2, width_ratios=(1.0, float(np.clip(len(answers) / 5, 0.6, 2.2))))
         axes, beside = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
         _confusion(beside, list(shares), answers, named)
-        pen.name_rows(axes, beside, [_short(name, 18) for name in shares])
+        pen.name_rows(axes, beside, [fitting(name, 18) for name in shares])
     else:
         axes = figure.add_subplot(1, 1, 1)
-        pen.name_rows(axes, axes, [_short(name, 18) for name in shares])
+        pen.name_rows(axes, axes, [fitting(name, 18) for name in shares])
         axes.tick_params(labelleft=True)
     pen.dress(axes, x="rightly named (%)")
     for row, (name, share) in enumerate(shares.items()):
@@ -293,12 +288,12 @@ def _confusion(axes: Axes, shapes: list[str], answers: list[str], named: Mapping
     pen.dress(axes, x="named", grid=False)
     x, y = np.arange(len(answers), dtype=float), np.arange(len(shapes), dtype=float)
     right = np.array([[shape == answer for answer in answers] for shape in shapes])
-    paint(axes, x, y, np.where(right, 0, 1), 0.65 * share, [_AREA, _PERIMETER])
+    paint(axes, x, y, np.where(right, 0, 1), 0.65 * share, [AREA, PERIMETER])
     for row, column in zip(*(found.tolist() for found in np.nonzero(counts)), strict=True):
         pen.text(axes, (column, row), f"{counts[row, column]:.0f}", side="center")
     axes.set_xticks(
         x,
-        [_short(name, 18) for name in answers],
+        [fitting(name, 18) for name in answers],
         rotation=60 if len(answers) > 3 else 0,
         ha="right" if len(answers) > 3 else "center",
     )
@@ -317,86 +312,10 @@ def uniform_figure(p_values: Mapping[str, Floats]) -> Figure:
         pen.band(axes, expected, low, high, pen.MUTED, alpha=0.22)
         pen.line(axes, [0, 1], [0, 1], pen.MUTED, width=0.9, style="--")
         size = float(np.clip(600 / max(found.size, 1), 3.0, 12.0))
-        pen.dots(axes, expected, found, _AREA, size=size, pixels=found.size > _MANY, gid=f"p {title}")
+        pen.dots(axes, expected, found, AREA, size=size, pixels=found.size > MANY_DOTS, gid=f"p {title}")
         axes.set_xlim(0, 1)
         axes.set_ylim(0, 1)
         axes.set_aspect("equal")
         axes.set_xticks([0, 0.5, 1], ["0", "0.5", "1"])
         axes.set_yticks([0, 0.5, 1], ["0", "0.5", "1"])
     return figure
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Strip:
-    """One thing followed over the sessions: ``values`` (n,), and the ``names`` of those that stand out, by index."""
-
-    title: str
-    values: Floats
-    names: Mapping[int, str]
-
-
-def health_figure(strips: Sequence[Strip], started: NDArray[np.datetime64] | None) -> Figure:
-    """Draw one strip for each thing over the time of the sessions' beginning, or over their order without times."""
-    figure = pen.new_figure(_WIDTH_IN, 0.5 + 1.25 * len(strips))
-    first: Axes | None = None
-    for index, strip in enumerate(strips):
-        axes = figure.add_subplot(len(strips), 1, index + 1, sharex=first)
-        first = first or axes
-        last = index == len(strips) - 1
-        pen.dress(axes, x=("begun" if started is not None else "session, in order") if last else "", title=strip.title)
-        x = np.arange(strip.values.size, dtype=np.float64) if started is None else _days(started)
-        known = np.isfinite(strip.values) & np.isfinite(x)
-        out = np.zeros(strip.values.size, dtype=np.bool_)
-        out[list(strip.names)] = True
-        plain, odd = known & ~out, known & out
-        pixels = int(plain.sum()) > _MANY
-        pen.dots(axes, x[plain], strip.values[plain], _AREA, size=9, alpha=0.7, pixels=pixels, gid=strip.title)
-        pen.dots(axes, x[odd], strip.values[odd], _PERIMETER, size=26, marker="D", edge=pen.INK, above=4)
-        if known.any():
-            _room(axes, strip.values[known])
-            pen.level(axes, float(np.median(strip.values[known])), pen.MUTED, width=0.8)
-        _label(axes, x, strip)
-        if not last:
-            axes.tick_params(labelbottom=False)
-    if started is not None and first is not None:
-        locator = AutoDateLocator(minticks=3, maxticks=8)
-        first.xaxis.set_major_locator(locator)
-        first.xaxis.set_major_formatter(ConciseDateFormatter(locator))
-    return figure
-
-
-def _days(started: NDArray[np.datetime64]) -> Floats:
-    """Matplotlib's days since 1970; NaN for what is no time."""
-    seconds = started.astype("datetime64[ms]").astype(float) / 1000
-    return np.where(np.isnat(started), np.nan, seconds / 86400)
-
-
-def _room(axes: Axes, values: Floats) -> None:
-    low, high = float(values.min()), float(values.max())
-    free = 0.12 * max(high - low, 0.02 * abs(high), 1e-9)
-    axes.set_ylim(low - free, high + free)
-
-
-def _label(axes: Axes, x: Floats, strip: Strip) -> None:
-    """Name the outliers, towards the side with more room."""
-    known = x[np.isfinite(x)]
-    middle = float((known.min() + known.max()) / 2) if known.size else 0.0
-    for index, name in strip.names.items():
-        if np.isfinite(x[index]):
-            left = bool(x[index] <= middle)
-            place = (float(x[index]), float(strip.values[index]))
-            pen.text(
-                axes, place, _short(name, 34), shift=(7 if left else -7, 0), side="left" if left else "right", halo=True
-            )
-
-
-def _short(name: str, most: int) -> str:
-    """A name that fits, without what the font lacks or matplotlib would take for mathematics."""
-    known = _letters()
-    name = "".join(letter if ord(letter) in known else "\ufffd" for letter in name)
-    return (name if len(name) <= most else f"{name[: most - 1]}…").replace("$", r"\$")
-
-
-@cache
-def _letters() -> frozenset[int]:
-    return frozenset(get_font(findfont(FontProperties())).get_charmap())

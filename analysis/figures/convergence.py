@@ -123,7 +123,15 @@ def posterior_figure(
     pen.count_axis(axes, float(estimates["n"].max()) if len(estimates) else 2)
     axes.set_ylim(-0.02, 1.04)
     pen.level(axes, stop_at, pen.INK, gid="stop")
-    pen.text(axes, (0.01, stop_at), f"stop at {stop_at:g}", shift=(0, -7), frame="x axes, y data", colour=pen.MUTED)
+    pen.text(
+        axes,
+        (0.99, stop_at),
+        f"stop at {stop_at:g}",
+        shift=(0, -7),
+        frame="x axes, y data",
+        colour=pen.MUTED,
+        side="right",
+    )
     if posteriors is not None:
         _every_entry(axes, posteriors, titles, most)
     else:

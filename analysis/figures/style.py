@@ -1,5 +1,5 @@
-# pyright: reportUnknownMemberType=false
-# (matplotlib's stubs leave the **kwargs of savefig untyped)
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+# (matplotlib's stubs leave the **kwargs of savefig and the fonts' paths untyped)
 """The paper's colour code, and how a figure leaves the house.
 
 Figures are made without pyplot and without touching matplotlib's global settings, so that a server, a batch worker
@@ -11,9 +11,11 @@ from __future__ import annotations
 import io
 import re
 import zlib
+from functools import cache
 from pathlib import Path
 
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties, findfont, get_font
 
 # The paper's code (Fig. 2): pink circle, green pyramid, brown triangle, blue Statue of Liberty, orange tower. The
 # shades keep a contrast of 3:1 on white and on the dark page, and differ in lightness for colour-blind readers.
@@ -26,6 +28,9 @@ _PAPER = (
     (("square",), "#808080"),
 )
 _OTHERS = ("#7a68c8", "#3a8f9c", "#b8604a", "#7d8a2e", "#a05fb0", "#4f7fb5", "#8a7350", "#c05a78")
+
+AREA, PERIMETER = "#0b7bc1", "#d97a00"  # Okabe and Ito's pair: told apart by all eyes
+MANY_DOTS = 400  # more are drawn as pixels
 
 
 def colour_of(name: str) -> str:
@@ -71,3 +76,15 @@ def save_figure(figure: Figure, path: Path, *, dpi: int = 200) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=dpi, facecolor="white")
     return path
+
+
+def fitting(name: str, most: int) -> str:
+    """A name that fits, without what the font lacks or matplotlib would take for mathematics."""
+    known = _letters()
+    name = "".join(letter if ord(letter) in known else "\ufffd" for letter in name)
+    return (name if len(name) <= most else f"{name[: most - 1]}…").replace("$", r"\$")
+
+
+@cache
+def _letters() -> frozenset[int]:
+    return frozenset(get_font(findfont(FontProperties())).get_charmap())

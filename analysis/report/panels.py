@@ -218,7 +218,8 @@ def _lines(result: SessionResult) -> Panel | LeftOut:
         title,
         lines_figure(result.true_lines, result.geometry, result.arena, name=result.name),
         f"Map of the arena with {len(result.true_lines)} straight runs, wall to wall, over the shape {result.title}.",
-        "The net should be even, without a favoured direction, corners no emptier than the middle allows.",
+        "The net should be even. A favoured direction is a turn that is not random, or a floor that slopes; an empty "
+        "corner or stripe is a place that the robot cannot reach, or does not dare to.",
     )
 
 

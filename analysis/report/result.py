@@ -92,6 +92,7 @@ class SessionResult:
         montecarlo: The curves and chords against simulated sessions; None where they cannot be compared.
         session: The session folder's name.
         provenance: Section -> what -> value: seed, settings, versions, devices, host figures.
+        history: (s of the session's clock, what befell it): parts, notes, pauses, lost links; empty if nothing did.
         warnings: What the session wants the reader to know, a sentence each.
     """
 
@@ -123,6 +124,7 @@ class SessionResult:
     montecarlo: MonteCarloCheck | None = None
     session: str = ""
     provenance: Mapping[str, Mapping[str, object]] = field(default_factory=dict[str, "Mapping[str, object]"])
+    history: Sequence[tuple[float, str]] = ()
     warnings: Sequence[str] = ()
 
     def __post_init__(self) -> None:

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.pulls import outlying
+from analysis.report.conclusion import Finding, Problem
 from analysis.report.result import ENDED_WELL
 from analysis.report.sheetrows import Rows, numbers, texts
-from analysis.report.verdict import Finding, Problem
 from analysis.report.words import count, listed, number
 
 Floats = NDArray[np.float64]

@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 from analysis.figures.batch import (
     Cloud,
     Errors,
-    Strip,
     clouds_figure,
     errors_figure,
-    health_figure,
     pulls_figure,
     recognition_figure,
     uniform_figure,
 )
+from analysis.figures.health import Strip, health_figure
 from analysis.pulls import Pull, Share
 from analysis.report.panels import LeftOut, Panel
 from analysis.report.sheethealth import vitals

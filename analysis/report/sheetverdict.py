@@ -9,9 +9,10 @@ import numpy as np
 import pandas as pd
 
 from analysis.pulls import Pull, Share, Uniformity, more_than
+from analysis.report.conclusion import Finding, Problem, Tone, Verdict
+from analysis.report.problems import FEW_LINES, cure_of_sizes
 from analysis.report.sheethealth import health_finding, health_problems
 from analysis.report.sheetrows import Rows, numbers, texts
-from analysis.report.verdict import FEW_LINES, Finding, Problem, Tone, Verdict, cure_of_sizes
 from analysis.report.words import count, listed, number, p_value, percent, signed, signed_with
 
 LEVEL = 0.01  # of any false alarm among all checks of one kind

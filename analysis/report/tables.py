@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -14,8 +14,8 @@ from analysis.compare import deviation
 from analysis.estimate import Estimate
 from analysis.figures.budget import name_of
 from analysis.figures.camera import agreement
+from analysis.report.problems import lines_to_tell_apart
 from analysis.report.result import SessionResult
-from analysis.report.verdict import lines_to_tell_apart
 from analysis.report.words import number, p_value, percent, plus_minus, probability, signed, signed_with
 
 _MOST_ENTRIES = 12
@@ -23,13 +23,14 @@ _MOST_ENTRIES = 12
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table as text. The first column heads its row; ``note`` stands under it."""
+    """A table as text. The first column heads its row; ``note`` stands under it. A ``told`` one ends in words."""
 
     name: str
     title: str
     heads: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     note: str = ""
+    told: bool = False
 
 
 def tables_of(result: SessionResult) -> list[Table]:
@@ -158,7 +159,15 @@ def _budget(budget: Budget) -> Table:
         for name, side in (("A", budget.area), ("P", budget.perimeter))
     )
     note = f"Per cent of the truth, ± one standard error. {closed} Counting statistics is off by {counted}."
-    return Table("budget", "Error budget", ("term", "A (%)", "P (%)", "how"), tuple(rows), note)
+    return Table("budget", "Error budget", ("term", "A (%)", "P (%)", "how"), tuple(rows), note, told=True)
+
+
+def history_table(result: SessionResult) -> Table | None:
+    """Give what befell the session, its parts, notes, pauses and lost links; None if nothing did."""
+    if not result.history:
+        return None
+    rows = tuple((number(t_s), text) for t_s, text in result.history)
+    return Table("history", "The session's log", ("time (s)", "what happened"), rows, told=True)
 
 
 def provenance_of(result: SessionResult) -> list[Table]:
@@ -176,11 +185,25 @@ def _flat(values: Mapping[str, object], prefix: str = "") -> list[tuple[str, str
     for key, value in values.items():
         if isinstance(value, Mapping):
             rows += _flat(cast("Mapping[str, object]", value), f"{prefix}{key}.")
-        elif isinstance(value, float):
-            rows.append((f"{prefix}{key}", f"{value:.6g}"))
+            continue
+        parts = _parts(value)
+        if any(isinstance(part, Mapping) for part in parts):
+            rows += _flat({str(index): part for index, part in enumerate(parts, start=1)}, f"{prefix}{key}.")
         else:
-            rows.append((f"{prefix}{key}", "–" if value is None else str(value)))
+            rows.append((f"{prefix}{key}", _written(value)))
     return rows
+
+
+def _parts(value: object) -> Sequence[object]:
+    return cast("Sequence[object]", value) if isinstance(value, list | tuple) else ()
+
+
+def _written(value: object) -> str:
+    if parts := _parts(value):
+        return ", ".join(map(_written, parts))
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return "–" if value in (None, [], ()) else f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def _real(value: object) -> float:

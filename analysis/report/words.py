@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 
 _GROUP = "\u202f"
@@ -69,6 +70,22 @@ def p_value(value: float) -> str:
     if not math.isfinite(value):
         return "unknown"
     return "< 0.001" if value < 0.001 else f"{value:.3f}"
+
+
+def p_is(value: float) -> str:
+    """Write what a p-value is: "p = 0.034" or "p < 0.001"."""
+    said = p_value(value)
+    return f"p {said}" if said.startswith("<") else f"p = {said}"
+
+
+def typographic(text: str) -> str:
+    """Set minus signs and powers of ten as in print: ``typographic("-0.3, 2e-05")`` is "−0.3, 2·10⁻⁵"."""
+    powers = re.sub(r"(?<=\d)e([+-]?)0*(\d+)\b", lambda found: f"·10{_raised(found[1] + found[2])}", text)
+    return re.sub(r"(?<![\w\d−-])-(?=\d)", "−", powers)
+
+
+def _raised(digits: str) -> str:
+    return digits.replace("+", "").translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
 def listed(names: Sequence[str], most: int = 5) -> str:

@@ -15,8 +15,9 @@ from analysis.figures import pen
 from analysis.figures.style import png_bytes, svg_text
 from analysis.report.panels import Panel, panels_of
 from analysis.report.result import SessionResult
-from analysis.report.tables import provenance_of, tables_of
+from analysis.report.tables import history_table, provenance_of, tables_of
 from analysis.report.verdict import verdict_of
+from analysis.report.words import typographic
 from lab.base.errors import RequestError
 from lab.base.files import write_aside
 
@@ -72,6 +73,7 @@ def render_report(result: SessionResult) -> str:
         panels=[shown(panel) for panel in panels],
         left_out=left_out,
         tables=tables_of(result),
+        history=history_table(result),
         provenance=provenance_of(result),
     )
 
@@ -87,9 +89,19 @@ def page_of(template: str) -> Template:
 
 def _typeset(text: str) -> Markup:
     """Keep units on the line of their numbers, and set what stands between backticks as code."""
-    text = re.sub(r"(?<=[\d)]) (?=(?:%|cm|σ))", "\u202f", text)
-    code = Markup("<code>{}</code>")
-    return Markup("").join(code.format(part) if index % 2 else part for index, part in enumerate(text.split("`")))
+    return Markup("").join(
+        _code(part) if index % 2 else _with_units(typographic(part)) for index, part in enumerate(text.split("`"))
+    )
+
+
+def _code(text: str) -> Markup:
+    """A command or a setting: lines are broken between its words only."""
+    words = Markup(" ").join(Markup("<span>{}</span>").format(word) for word in text.split())
+    return Markup("<code>{}</code>").format(words)
+
+
+def _with_units(text: str) -> str:
+    return re.sub(r"(?<=[\d)]) (?=(?:%|cm|σ))|(?<=[pmNAP]) (?=[=<] )|(?<== )(?=$)|(?<=[\d%]) (?=± )", "\u202f", text)
 
 
 def shown(panel: Panel) -> Shown:

@@ -96,7 +96,7 @@ class _Batch:
         self.rows: dict[int, Row] = {}
         self.computed = 0
         self._places, self._cache, self._again, self._progress = places, cache, again, progress
-        self._versions = versions() | {"font": find_font().sha256}  # letters are set in it again
+        self._versions = {**versions(), "font": find_font().sha256}  # letters are set in it again
         self._keys: dict[Path, str] = {}  # of what is under way, by the folder that stands for its content
         self._same: dict[str, list[tuple[int, Row]]] = {}  # key → the sessions of that content
 

@@ -14,12 +14,14 @@ from lab.bench.pictures import Picture, Pictures, check_on_floor, draw_pictures
 from lab.bench.replayed import replayed_bench
 from lab.bench.world import virtual_world
 from lab.settings.settings import Settings
-from projector.device import ProjectorDevice, ProjectorError, open_projector
+from projector.device import ProjectorDevice, ProjectorError
+from projector.opening import open_projector
 from projector.shape import Shape
 from robot.bolt import Bolt
 from robot.device import RobotDevice
 from robot.selfguided import SelfGuided
-from tracking.cameras import Camera, Frame, open_camera
+from tracking.cameras import Camera, Frame
+from tracking.opening import open_camera
 from tracking.recorder import Recorder
 
 SETTLE_S = 0.3  # a projector's latency, and a light sample or a frame under way, after the picture changes

@@ -11,7 +11,7 @@ from typing import Any
 from lab.base.errors import RequestError
 from lab.base.timeline import Mark, Timeline
 from lab.reopen.rerun import BUMPS, Rerun, StoredLine, session_levels
-from lab.session.roller import SessionLevels
+from lab.session.levels import SessionLevels
 from lab.settings.sections import LinkSettings
 from lab.settings.settings import Settings
 from lab.store.layout import SessionFolderError

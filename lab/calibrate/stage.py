@@ -19,12 +19,14 @@ from lab.base.errors import RequestError
 from lab.base.pinhole import Pinhole
 from lab.bench.devices import SETTLE_S, keep_alive
 from lab.settings.settings import Settings
-from projector.device import ProjectorDevice, open_projector
+from projector.device import ProjectorDevice
+from projector.opening import open_projector
 from projector.patterns import crosses
 from projector.virtual import LightSettings, VirtualProjector
 from tracking.board import Board
 from tracking.boardscene import StagedCamera, board_scene, held, laid
-from tracking.cameras import Camera, CameraError, Frame, open_camera
+from tracking.cameras import Camera, CameraError, Frame
+from tracking.opening import open_camera
 from tracking.synthetic import CameraSettings, LightAt, OverheadScene
 
 Floats = NDArray[np.float64]

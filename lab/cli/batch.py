@@ -7,20 +7,18 @@ import threading
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import pandas as pd
 import typer
 
-from analysis.report.sheet import write_sheet
 from lab.base.errors import ChordlabError, RequestError
-from lab.base.files import write_aside
-from lab.batch.analyse import Analysed, analyse
-from lab.batch.cache import RowCache
-from lab.batch.places import places_below
-from lab.batch.shapes import per_shape
 from lab.cli.choosing import SchedulerOption, WorkersOption
-from lab.cli.output import JsonFlag, complain, emit, progress_bar, say, show_table
+from lab.cli.output import JsonFlag, QuietFlag, complain, emit, progress_bar, say, show_table
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from lab.batch.analyse import Analysed
 
 
 def batch(
@@ -30,17 +28,23 @@ def batch(
     scheduler: SchedulerOption = None,
     again: Annotated[bool, typer.Option("--again", help="Analyse anew what is known, too.")] = False,
     no_cache: Annotated[bool, typer.Option("--no-cache", help="Neither use nor keep what is known.")] = False,
+    quiet: QuietFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Analyse every session below ROOT: one table, one row a session; a broken one is a row with its reason.
+    """Analyse every session below ROOT. One table, one row a session; a broken one is a row with its reason.
 
     Nothing is written in the sessions. What is known from the last time is not worked out again.
 
     Example: chordlab batch sessions --out batch
     """
+    from lab.batch.analyse import analyse
+    from lab.batch.cache import RowCache
+    from lab.batch.places import places_below
+    from lab.batch.shapes import per_shape
+
     places = places_below(roots)
     _make(out)
-    with progress_bar("sessions", quiet=as_json) as update, _terminated_as_interrupted():
+    with progress_bar("sessions", quiet=quiet) as update, _terminated_as_interrupted():
         found = analyse(
             places,
             cache=None if no_cache else RowCache(out / "cache"),
@@ -64,7 +68,7 @@ def batch(
             }
         )
     else:
-        _tell(found, shapes, broken, files)
+        _tell(found, shapes, broken, files, quiet=quiet)
     if isinstance(found.stopped, ChordlabError):
         raise found.stopped
     if found.stopped is not None:
@@ -81,6 +85,9 @@ def _make(out: Path) -> None:
 
 
 def _write(table: pd.DataFrame, shapes: pd.DataFrame, out: Path) -> dict[str, Path]:
+    from analysis.report.sheet import write_sheet
+    from lab.base.files import write_aside
+
     files = {"table": out / "batch.parquet", "csv": out / "batch.csv", "shapes_csv": out / "shapes.csv"}
     try:
         write_aside(files["table"], table.to_parquet(index=False))
@@ -91,10 +98,18 @@ def _write(table: pd.DataFrame, shapes: pd.DataFrame, out: Path) -> dict[str, Pa
     return files | {"report": write_sheet(table, shapes, out / "report.html")}
 
 
-def _tell(found: Analysed, shapes: pd.DataFrame, broken: pd.DataFrame, files: dict[str, Path]) -> None:
+def _tell(found: Analysed, shapes: pd.DataFrame, broken: pd.DataFrame, files: dict[str, Path], *, quiet: bool) -> None:
+    import pandas as pd
+
+    from analysis.report.words import count, percent, signed, signed_with
+
+    if quiet:
+        say(str(files["report"]))
+        return
+
     def side(row: pd.Series[Any], name: str) -> str:
         error, sigma = row[f"{name}_error_rel"], row[f"{name}_error_sigma_rel"]
-        return f"{error:+.1%}" if pd.isna(sigma) else f"{error:+.1%} ± {sigma:.1%}"
+        return signed(100 * error) if pd.isna(sigma) else signed_with(100 * error, 100 * sigma)
 
     def spread(row: pd.Series[Any], name: str) -> str:
         sd = row[f"{name}_z_sd"]
@@ -104,7 +119,7 @@ def _tell(found: Analysed, shapes: pd.DataFrame, broken: pd.DataFrame, files: di
         (
             str(row["shape"]),
             str(row["sessions"]),
-            f"{row['right_share']:.0%}",
+            percent(row["right_share"], 0),
             side(row, "area"),
             spread(row, "area"),
             side(row, "perimeter"),
@@ -112,10 +127,10 @@ def _tell(found: Analysed, shapes: pd.DataFrame, broken: pd.DataFrame, files: di
         )
         for _, row in shapes.iterrows()
     ]
-    show_table("Sessions by shape", ("shape", "sessions", "right", "A error", "sd z", "P error", "sd z"), rows)
+    show_table("Sessions by shape", ("shape", "sessions", "right", "A error, %", "sd z", "P error, %", "sd z"), rows)
     for _, row in broken.iterrows():
         say(f"{row['session']}: {row['error']}")
-    say(f"{len(found.table)} sessions, {found.computed} of them analysed now")
+    say(f"{count(len(found.table), 'session')}, {found.computed} of them analysed now")
     say(str(files["report"]))
 
 

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from analysis.montecarlo import available_cores
 from lab.base.errors import RequestError
-from lab.calibrate.robot import Scales, calibrate_robot, profile_to_update, scales_of_session
 from lab.cli import calibrate_optics
-from lab.cli.output import JsonFlag, complain, emit, progress_bar, say, show_table
-from lab.settings.load import load_settings
-from robot.characterise import applied, comments_of
-from robot.profile import RobotProfile, save_profile
+from lab.cli.completing import sessions, settings_files
+from lab.cli.output import JsonFlag, QuietFlag, complain, emit, progress_bar, say, show_table
+
+if TYPE_CHECKING:
+    from lab.calibrate.robot import Scales
+    from robot.profile import RobotProfile
+
 
 app = typer.Typer(help="Calibrate the bench's devices.", no_args_is_help=True)
 
@@ -32,19 +33,30 @@ def calibrate() -> None:
 @app.command("robot")
 def robot(
     session: Annotated[
-        Path | None, typer.Argument(metavar="[SESSION.toml]", help="The bench; none: the virtual.")
+        Path | None,
+        typer.Argument(metavar="[SESSION.toml]", help="The bench; none: the virtual.", autocompletion=settings_files),
     ] = None,
     runs: Annotated[int | None, typer.Option(help="How many runs to roll; 20 when not given.")] = None,
     stored: Annotated[
-        Path | None, typer.Option("--from", metavar="DIR", help="Take a stored, filmed session instead of rolling.")
+        Path | None,
+        typer.Option(
+            "--from", metavar="DIR", help="Take a stored, filmed session instead of rolling.", autocompletion=sessions
+        ),
     ] = None,
     out: Annotated[Path, typer.Option(help="The profile to write or bring up to date.")] = Path("robot-profile.toml"),
+    quiet: QuietFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Find the robot's speed scale, odometer scale and drift by the camera, and put them into its profile.
+    """Find the robot's scales and drift by the camera. Of speed and odometer; they are put into its profile.
 
     Example: chordlab calibrate robot --runs 20 --out robot-profile.toml
     """
+    from analysis.montecarlo import available_cores
+    from lab.calibrate.robot import calibrate_robot, profile_to_update, scales_of_session
+    from lab.settings.load import load_settings
+    from robot.characterise import applied, comments_of
+    from robot.profile import save_profile
+
     if stored is not None and (session is not None or runs is not None):
         raise RequestError(
             "--from takes the bench and the runs of the stored session; leave SESSION.toml and --runs out"
@@ -54,10 +66,10 @@ def robot(
     profile, comments = profile_to_update(out, settings.profile())
 
     def tell(text: str) -> None:
-        if not as_json:
+        if not (quiet or as_json):
             complain(text)
 
-    with progress_bar("tracking the runs", quiet=as_json) as update:
+    with progress_bar("tracking the runs", quiet=quiet) as update:
         if stored is not None:
             scales = scales_of_session(stored, workers=workers, progress=update)
         else:
@@ -79,7 +91,8 @@ def robot(
             }
         )
         return
-    _show(scales, profile, effects)
+    if not quiet:
+        _show(scales, profile, effects)
     say(str(out))
 
 

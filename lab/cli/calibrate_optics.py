@@ -5,19 +5,22 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lab.base.errors import RequestError
-from lab.calibrate.optics import VIEWS, calibrate_by_hand, calibrate_camera, calibrate_projector
-from lab.calibrate.stage import Operator, Step
-from lab.cli.output import JsonFlag, complain, emit, say, show_table
-from lab.settings.load import load_settings
-from tracking.board import RULER_CM, Board, print_board, read_board
-from tracking.calibration import Calibration, save_calibration
+from lab.cli.completing import settings_files
+from lab.cli.output import JsonFlag, QuietFlag, complain, emit, say, show_table
 
-SessionArgument = Annotated[Path | None, typer.Argument(metavar="[SESSION.toml]", help="The bench; none: the virtual.")]
+if TYPE_CHECKING:
+    from lab.calibrate.stage import Operator, Step
+
+
+SessionArgument = Annotated[
+    Path | None,
+    typer.Argument(metavar="[SESSION.toml]", help="The bench; none: the virtual.", autocompletion=settings_files),
+]
 
 
 def camera(
@@ -28,23 +31,31 @@ def camera(
     ] = None,
     paper: Annotated[str, typer.Option(help="Paper of --make-board: A4 or A3; the larger, the better.")] = "A4",
     ruler_cm: Annotated[
-        float, typer.Option(min=5, max=20, help="What the printed ruler of 10 cm really measures.")
-    ] = RULER_CM,
-    frames: Annotated[int, typer.Option(min=8, max=200, help="Views of the held board.")] = VIEWS,
+        float | None, typer.Option(min=5, max=20, help="What the printed ruler of 10 cm really measures.")
+    ] = None,
+    frames: Annotated[
+        int | None, typer.Option(min=8, max=200, help="Views of the held board; 25 when not given.")
+    ] = None,
     stored: Annotated[
         Path | None,
         typer.Option("--from", metavar="VIDEO|DIR", help="Views in a video or a folder of pictures, not live."),
     ] = None,
     origin_s: Annotated[
-        float | None, typer.Option(help="When the board lies at the origin, in a video; none: at its end.")
+        float | None, typer.Option(min=0, help="When the board lies at the origin, in a video; none: at its end.")
     ] = None,
     out: Annotated[Path, typer.Option(help="The calibration to write.")] = Path("camera.json"),
+    quiet: QuietFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Find the camera's lens and its pose over the arena, with a printed board.
+    """Find the camera's lens and pose, with a printed board.
 
     Example: chordlab calibrate camera --make-board board.pdf; chordlab calibrate camera bench.toml --out camera.json
     """
+    from lab.calibrate.optics import VIEWS, calibrate_camera
+    from lab.settings.load import load_settings
+    from tracking.board import RULER_CM, Board, print_board, read_board
+    from tracking.calibration import save_calibration
+
     if make_board is not None:
         made = print_board(make_board, paper)
         if as_json:
@@ -52,16 +63,29 @@ def camera(
         else:
             say(str(make_board))
         return
-    printed = (read_board(board) if board is not None else Board()).scaled(ruler_cm / RULER_CM)
+    printed = (read_board(board) if board is not None else Board()).scaled(
+        1.0 if ruler_cm is None else ruler_cm / RULER_CM
+    )
+    if origin_s is not None and stored is None:
+        raise RequestError("--origin-s is a time in a video; name it by --from")
     check_writable(out)
     settings = load_settings(session)
     done = calibrate_camera(
-        settings, printed, person(), views=frames, source=stored, origin_s=origin_s, say=_teller(as_json)
+        settings,
+        printed,
+        person(),
+        views=frames or VIEWS,
+        source=stored,
+        origin_s=origin_s,
+        say=_teller(quiet or as_json),
     )
     save_calibration(done.calibration, out)
     summary = done.fit.summary()
     if as_json:
         emit({**summary, "out": out})
+        return
+    if quiet:
+        say(str(out))
         return
     rows = [
         (name, f"{value['value']:.5g}", f"{value['std']:.2g}" if value["std"] else "held")
@@ -87,17 +111,22 @@ def projector(
     ] = None,
     by_hand: Annotated[bool, typer.Option("--by-hand", help="Without a camera: measure five crosses by tape.")] = False,
     out: Annotated[Path, typer.Option(help="The calibration to write.")] = Path("projector.json"),
+    quiet: QuietFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Find the projector's pose and lens, by the calibrated camera or with a tape.
+    """Find the projector's pose and lens. By the calibrated camera, or with a tape.
 
     Example: chordlab calibrate projector bench.toml --raised-cm 10 --out projector.json
     """
+    from lab.calibrate.optics import calibrate_by_hand, calibrate_projector
+    from lab.settings.load import load_settings
+    from tracking.calibration import Calibration, save_calibration
+
     if by_hand and raised_cm is not None:
         raise RequestError("--by-hand measures on the floor alone; leave --raised-cm out")
     check_writable(out)
     settings = load_settings(session)
-    tell = _teller(as_json)
+    tell = _teller(quiet or as_json)
     if by_hand:
         done = calibrate_by_hand(settings, person(), say=tell)
     else:
@@ -107,6 +136,9 @@ def projector(
     summary = done.summary()
     if as_json:
         emit({**summary, "out": out})
+        return
+    if quiet:
+        say(str(out))
         return
     planes = " and ".join("the floor" if height == 0 else f"{height:g} cm above it" for height in done.fit.planes_cm)
     say(f"seen on {planes}: {done.fit.points} points fit to {10 * done.fit.rms_cm:.2f} mm")
@@ -124,6 +156,7 @@ def projector(
 
 def person() -> Operator:
     """Somebody at the keyboard: told on stderr, answers on stdin."""
+    from lab.calibrate.stage import Operator
 
     async def ask(step: Step) -> None:
         complain(f"{step} Then press Enter.")

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from analysis.montecarlo import available_cores
-from lab.calibrate.characterise import RUNS, characterise_robot, settings_for
-from lab.calibrate.robot import profile_to_update
-from lab.cli.output import JsonFlag, complain, emit, progress_bar, say, show_table
-from robot.characterise import Finding
-from robot.profile import RobotProfile
+from lab.cli.output import JsonFlag, QuietFlag, complain, emit, progress_bar, say, show_table
+
+if TYPE_CHECKING:
+    from robot.characterise import Finding
 
 
 def characterise(
@@ -23,16 +21,24 @@ def characterise(
         typer.Option(metavar="SESSION.toml", help="The bench it is on: projector and camera; none: the robot alone."),
     ] = None,
     out: Annotated[Path, typer.Option(help="The profile to write or bring up to date.")] = Path("robot-profile.toml"),
-    runs: Annotated[int, typer.Option(min=4, max=500, help="Long runs for scales and drift.")] = RUNS,
+    runs: Annotated[
+        int | None, typer.Option(min=4, max=500, help="Long runs for scales and drift; 20 when not given.")
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the headings and phases that are tried.")] = 1,
+    quiet: QuietFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Measure a robot's speeds, latencies, scales and signs, and write them as its profile. Takes some five minutes.
+    """Measure a robot, and write its profile. Speeds, latencies, scales and signs, in some five minutes.
 
     Put the robot in mid-arena, walls around it, and leave it there.
 
     Example: chordlab robot characterise virtual --out robot-profile.toml
     """
+    from analysis.montecarlo import available_cores
+    from lab.calibrate.characterise import RUNS, characterise_robot, settings_for
+    from lab.calibrate.robot import profile_to_update
+    from robot.profile import RobotProfile
+
     bench = settings_for(name, settings)
     # Now, since a file that cannot be written is better told before five minutes of rolling than after.
     profile, comments = profile_to_update(out, bench.profile() if bench is not None else RobotProfile())
@@ -40,15 +46,15 @@ def characterise(
     def hush(_text: str) -> None:
         return
 
-    with progress_bar("tracking the runs", quiet=as_json) as update:
+    with progress_bar("tracking the runs", quiet=quiet) as update:
         found = characterise_robot(
             name,
             bench,
             profile,
             seed=seed,
-            runs=runs,
+            runs=runs or RUNS,
             workers=max(1, available_cores() // 2),
-            say=hush if as_json else complain,
+            say=hush if quiet or as_json else complain,
             progress=update,
         )
     found.save(out, comments)
@@ -61,6 +67,9 @@ def characterise(
                 "findings": [asdict(finding) for finding in found.findings],
             }
         )
+        return
+    if quiet:
+        say(str(out))
         return
     rows = [(finding.key, *_figures(finding), str(finding.n)) for finding in found.findings]
     show_table(f"{found.robot}, measured in {found.robot_s:.0f} s", ("key", "value", "±", "n"), rows)

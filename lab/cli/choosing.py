@@ -5,26 +5,41 @@ from __future__ import annotations
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lab.base.errors import RequestError
-from projector.collections import COLLECTIONS
-from projector.dictionary import Shape, load_dictionary, shape_from
-from projector.text import TEXT_PREFIX
+from lab.cli.completing import collections, shapes
+from projector.catalogue import COLLECTIONS
+
+if TYPE_CHECKING:
+    from projector.dictionary import Shape
+
 
 PICTURES = (".png", ".svg", ".pdf")
 
 ShapeArgument = Annotated[
-    str, typer.Argument(metavar="SHAPE", help="A dictionary name, text:WORD, or a .geojson, .svg or .png file.")
+    str,
+    typer.Argument(
+        metavar="SHAPE", help="A dictionary name, text:WORD, or a .geojson, .svg or .png file.", autocompletion=shapes
+    ),
 ]
 ShapeArguments = Annotated[
     list[str] | None,
-    typer.Argument(metavar="[SHAPE]...", help="Dictionary names, text:WORD, or .geojson, .svg or .png files."),
+    typer.Argument(
+        metavar="[SHAPE]...",
+        help="Dictionary names, text:WORD, or .geojson, .svg or .png files.",
+        autocompletion=shapes,
+    ),
 ]
 FontOption = Annotated[Path | None, typer.Option("--font", help="Font file for text:WORD.")]
-CollectionOption = Annotated[str | None, typer.Option("--collection", help=f"One of {', '.join(COLLECTIONS)}.")]
+CollectionOption = Annotated[
+    str | None, typer.Option("--collection", help=f"One of {', '.join(COLLECTIONS)}.", autocompletion=collections)
+]
+ConfidenceOption = Annotated[
+    float, typer.Option("--confidence", min=0.5, max=1, help="Chance of being right that is asked for.")
+]
 WorkersOption = Annotated[
     int | None, typer.Option("--workers", min=0, help="Processes that share the work; 0: this one alone.")
 ]
@@ -35,6 +50,9 @@ SchedulerOption = Annotated[
 
 def chosen_shapes(specs: Sequence[str] | None, collection: str | None, font: Path | None) -> list[Shape]:
     """A collection and what is named beside it. Raises RequestError where two shapes share a name."""
+    from projector.dictionary import load_dictionary, shape_from
+    from projector.text import TEXT_PREFIX
+
     known = {} if collection is None else load_dictionary(collection, font=font)
     for spec in specs or ():
         shape = shape_from(spec, font=font if spec.startswith(TEXT_PREFIX) else None)

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
-from analysis.figures.classes import classes_figure
-from analysis.figures.style import save_figure
-from lab.batch.places import sessions_below
 from lab.cli.choosing import leaving, picture_path
-from lab.cli.output import JsonFlag, emit, say, show_table
-from lab.recognise.classes import Sorted, sort_sessions
+from lab.cli.output import JsonFlag, QuietFlag, emit, say, show_table
+
+if TYPE_CHECKING:
+    from lab.recognise.classes import Sorted
 
 
 def classes(
@@ -28,12 +26,20 @@ def classes(
     by: Annotated[str, typer.Option("--by", help="size (A and P) or lines (five means of the lines).")] = "size",
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random starts.")] = 1,
     out: Annotated[Path | None, typer.Option("--out", help="Picture of the (P, A) plane, .svg, .png or .pdf.")] = None,
+    quiet: QuietFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Sort sessions by what their lines say, as if no shape had a name.
+    """Sort sessions by their lines, as if no shape had a name.
 
     Example: chordlab classes sessions --out classes.svg
     """
+    import numpy as np
+
+    from analysis.figures.classes import classes_figure
+    from analysis.figures.style import save_figure
+    from lab.batch.places import sessions_below
+    from lab.recognise.classes import sort_sessions
+
     target = picture_path(out) if out else None
     found = sort_sessions(
         sessions_below(roots), np.random.default_rng(seed), number=number, method=method, lines=lines, kind=by
@@ -43,6 +49,9 @@ def classes(
             save_figure(classes_figure(found.points), target)
     if as_json:
         emit({**_figures(found), "picture": target})
+        return
+    if quiet and target is not None:
+        say(str(target))
         return
     show_table(
         f"{found.classes.number} classes of {len(found.points)} runs ({found.classes.criterion})",

@@ -5,15 +5,16 @@ from __future__ import annotations
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lab.base.errors import RequestError
-from lab.cli.output import JsonFlag, emit, progress_bar, say, show_table
-from lab.doctor.bundle import write_bundle
-from lab.doctor.examine import examine
-from lab.doctor.finding import Finding
+from lab.cli.completing import sessions
+from lab.cli.output import JsonFlag, QuietFlag, emit, progress_bar, say, show_table
+
+if TYPE_CHECKING:
+    from lab.doctor.finding import Finding
 
 
 def doctor(
@@ -24,23 +25,32 @@ def doctor(
         bool, typer.Option("--bundle", help="Also write one archive for a bug report, without personal paths.")
     ] = False,
     session: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="With --bundle: put a session's manifest and log into it.")
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="With --bundle: put a session's manifest and log into it.", autocompletion=sessions
+        ),
     ] = None,
     with_light: Annotated[
         bool, typer.Option("--with-light", help="With --bundle: the session's raw light samples too.")
     ] = False,
     out: Annotated[Path, typer.Option(help="Where sessions would be stored.")] = Path("sessions"),
+    quiet: QuietFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Check Python, packages, Bluetooth, cameras, displays, disk, clocks. Exit 1 when no virtual session can run here.
+    """Say what this machine lacks, and the cure. Exit code 1 where no virtual session can run.
+
+    It looks at Python, packages, Bluetooth, cameras, displays, disk and clocks.
 
     Example: chordlab doctor --bundle report.zip --session sessions/2026-11-23T1042_eiffel_ab12
     """
+    from lab.doctor.bundle import write_bundle
+    from lab.doctor.examine import examine
+
     if not bundle and (file is not None or session is not None or with_light):
         raise RequestError("FILE.zip, --session and --with-light go with --bundle; add it")
     if with_light and session is None:
         raise RequestError("--with-light takes a session's samples; name it by --session DIR")
-    with progress_bar("looking", quiet=as_json) as update:
+    with progress_bar("looking", quiet=quiet) as update:
         findings = examine(out, update)
     broken = [finding for finding in findings if finding.state == "broken"]
     archive = None
@@ -50,7 +60,8 @@ def doctor(
     if as_json:
         emit({"ok": not broken, "findings": [asdict(finding) for finding in findings], "bundle": archive})
     else:
-        show_table("This machine", ("check", "state", "found", "cure"), _rows(findings))
+        if not quiet:
+            show_table("This machine", ("check", "state", "found", "cure"), _rows(findings))
         say(_verdict(findings))
         if archive is not None:
             say(f"{archive}  {archive.stat().st_size / 1e3:.0f} kB; look through it before you send it")

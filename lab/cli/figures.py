@@ -7,17 +7,9 @@ from typing import Annotated
 
 import typer
 
-from analysis.figures.paper.panel import chosen_panels
 from lab.base.errors import RequestError
-from lab.batch.places import sessions_below
 from lab.cli.choosing import FontOption, SchedulerOption, WorkersOption
-from lab.cli.output import JsonFlag, complain, emit, progress_bar, say
-from lab.figures.draw import SHEET, as_found, draw_figures
-from lab.figures.robots import NO_SESSIONS, stored_robots
-from lab.figures.workbench import Scale
-from lab.spread.spread import spreading
-from projector.dictionary import load_dictionary
-from projector.text import find_font
+from lab.cli.output import JsonFlag, QuietFlag, complain, emit, progress_bar, say
 
 FILMED = {"1B", "1C", "1D", "1E"}
 FROM_SESSIONS = FILMED | {"1F", "1G", "2A", "2B", "2C"}
@@ -36,17 +28,27 @@ def figures(
     font: FontOption = None,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
+    quiet: QuietFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Draw the paper's figures: each panel as SVG and PNG, the data behind it as CSV, and a page with captions.
+    """Draw the paper's figures. Each panel as SVG and PNG, the data behind it as CSV, and a page with captions.
 
     Example: chordlab figures --out figures --only 1G,2D
     """
+    from analysis.figures.paper.panel import chosen_panels
+    from lab.batch.places import sessions_below
+    from lab.figures.draw import SHEET, as_found, draw_figures
+    from lab.figures.robots import NO_SESSIONS, stored_robots
+    from lab.figures.workbench import Scale
+    from lab.spread.spread import spreading
+    from projector.dictionary import load_dictionary
+    from projector.text import find_font
+
     names = chosen_panels(only)
     scale = Scale(lines=lines, runs=runs, blinks=_counts(blinks))
     stored = NO_SESSIONS
     typeface = find_font(font) if any(name.startswith("3") for name in names) else None
-    with progress_bar("figures", quiet=as_json) as update:
+    with progress_bar("figures", quiet=quiet) as update:
         if sessions is not None and FROM_SESSIONS & set(names):
             film = bool(FILMED & set(names))
             stored = stored_robots(sessions_below([sessions]), load_dictionary(), film=film)
@@ -54,12 +56,12 @@ def figures(
         drawn = draw_figures(
             names, out, seed=seed, scale=scale, font=typeface, stored=stored, progress=update, mapper=mapper
         )
-    for session, reason in drawn.left_out:
+    for session, reason in () if quiet else drawn.left_out:
         complain(f"{session} is left out: {reason}")
     if as_json:
         emit({"out": out, "files": drawn.files, "left_out": drawn.left_out, "panels": as_found(drawn)})
         return
-    say(f"{len(drawn.panels)} panels: {out / SHEET}")
+    say(str(out / SHEET) if quiet else f"{len(drawn.panels)} panels: {out / SHEET}")
 
 
 def _counts(text: str) -> tuple[int, ...]:

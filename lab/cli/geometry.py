@@ -3,27 +3,27 @@
 from __future__ import annotations
 
 import time
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
-from shapely.geometry import Polygon
 
-from analysis.exploration import Turning, disc_arena, explore, rectangle_arena
-from analysis.montecarlo import simulate as simulate_runs
-from analysis.quadrature import exact_moments
-from analysis.sensor import SensorModel
+from analysis.turning import Turning
 from lab.base.errors import RequestError
-from lab.cli.output import JsonFlag, emit, progress_bar, say, show_table
-from lab.cli.shapes import FontOption, ShapeArgument
-from projector.dictionary import shape_from
+from lab.cli.choosing import FontOption, ShapeArgument
+from lab.cli.output import JsonFlag, QuietFlag, emit, progress_bar, say, show_table
+
+if TYPE_CHECKING:
+    from shapely.geometry import Polygon
 
 
 def moments(shape: ShapeArgument, font: FontOption = None, as_json: JsonFlag = False) -> None:
-    """Exact moments of a shape's random lines, by quadrature; sigmas are for one line, divide by √N.
+    """Exact moments of a shape's random lines, by quadrature. Sigmas are for one line: divide by √N.
 
     Example: chordlab moments square
     """
+    from analysis.quadrature import exact_moments
+    from projector.dictionary import shape_from
+
     exact = exact_moments(shape_from(shape, font=font).geometry)
     data = exact.to_dict()
     if as_json:
@@ -50,18 +50,26 @@ def simulate(
     ] = None,
     footprint_cm: Annotated[float, typer.Option(min=0, help="Radius of floor that the light is averaged over.")] = 0.0,
     font: FontOption = None,
+    quiet: QuietFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Monte Carlo: area and perimeter as RUNS robots would find them after LINES crossing lines each.
+    """Monte Carlo: A and P as RUNS robots would find them. After LINES crossing lines each.
 
     Example: chordlab simulate eiffel --lines 300 --runs 1000 --seed 1
     """
+    import numpy as np
+
+    from analysis.exploration import explore
+    from analysis.montecarlo import simulate as simulate_runs
+    from analysis.sensor import SensorModel
+    from projector.dictionary import shape_from
+
     sensor = None if step_cm is None else SensorModel(step_cm, footprint_cm)
     if arena is None and (sensor is not None or turning is not Turning.LAMBERT):
         raise RequestError("a way of turning and a light sensor need an arena: add --arena 60 or --arena 120x90")
     drawn = shape_from(shape, font=font)
     started_s = time.perf_counter()
-    with progress_bar("runs", quiet=as_json) as update:
+    with progress_bar("runs", quiet=quiet) as update:
         rng = np.random.default_rng(seed)
         if arena is None:
             result = simulate_runs(drawn.geometry, lines=lines, runs=runs, rng=rng, progress=update)
@@ -95,6 +103,8 @@ def simulate(
 
 def _arena(text: str) -> Polygon:
     """The arena of ``--arena``: a radius, or width x height, in cm."""
+    from analysis.exploration import disc_arena, rectangle_arena
+
     try:
         sides = [float(side) for side in text.lower().split("x")]
     except ValueError:

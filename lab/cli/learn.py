@@ -8,7 +8,6 @@ from typing import Annotated
 
 import typer
 
-from analysis.tablestore import TableStore
 from lab.cli.choosing import (
     CollectionOption,
     FontOption,
@@ -17,11 +16,8 @@ from lab.cli.choosing import (
     WorkersOption,
     chosen_shapes,
 )
-from lab.cli.output import JsonFlag, emit, progress_bar, say
-from lab.recognise.recognisers import tables_for
-from lab.settings.load import load_settings
-from lab.spread.spread import spreading
-from projector.collections import PAPER
+from lab.cli.output import JsonFlag, QuietFlag, emit, progress_bar, say
+from projector.catalogue import PAPER
 
 
 def learn(
@@ -33,17 +29,23 @@ def learn(
     font: FontOption = None,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
+    quiet: QuietFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Learn how the lines of each entry look through the robot's sensor, and keep it for the sessions to come.
+    """Learn how entries look through the robot's sensor. It is kept for the sessions to come.
 
     A session learns what it lacks by itself; a large collection is learnt sooner by many.
 
     Example: chordlab shapes learn --collection letters --workers 2
     """
+    from analysis.tablestore import TableStore
+    from lab.recognise.recognisers import tables_for
+    from lab.settings.load import load_settings
+    from lab.spread.spread import spreading
+
     chosen = chosen_shapes(shapes, collection or (None if shapes else PAPER), font)
     store, began_s = TableStore(), time.perf_counter()
-    with progress_bar("entries", quiet=as_json) as update:
+    with progress_bar("entries", quiet=quiet) as update:
         tables_for(
             {shape.name: shape for shape in chosen},
             load_settings(session, {}),

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from lab.base.errors import RequestError
-from lab.live.channel import Ends
-from lab.live.live import Live
 from lab.live.server import LOOPBACK, listen, page_server
-from lab.settings.settings import Settings
+
+if TYPE_CHECKING:
+    from lab.live.channel import Ends
+    from lab.live.live import Live
+    from lab.settings.settings import Settings
+
 
 FOLLOWED_SPEED = 20.0
 """How many times real time a virtual bench goes while somebody looks, so that a person can follow it."""
@@ -57,6 +60,8 @@ class Paging:
         Raises:
             RequestError: a pace is asked for of a real bench.
         """
+        from lab.live.live import Live
+
         if self._speed is not None and not settings.is_virtual:
             raise RequestError("--speed is for the virtual bench: a real one goes at its own; leave it out")
         speed = self._speed

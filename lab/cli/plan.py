@@ -4,26 +4,27 @@ from __future__ import annotations
 
 import re
 from dataclasses import asdict
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
 from lab.base.errors import RequestError
-from lab.cli.choosing import CollectionOption, FontOption, ShapeArguments, chosen_shapes
-from lab.cli.output import JsonFlag, emit, progress_bar, say, show_table
-from lab.plan import Goal, Plan
-from lab.plan import plan as plan_sessions
-from lab.settings.load import load_settings
-from lab.settings.settings import Settings
-from projector.collections import PAPER, load_dictionary
+from lab.cli.choosing import CollectionOption, ConfidenceOption, FontOption, ShapeArguments, chosen_shapes
+from lab.cli.output import JsonFlag, QuietFlag, emit, progress_bar, say, show_table
+from projector.catalogue import PAPER
+
+if TYPE_CHECKING:
+    from lab.plan import Goal, Plan
+    from lab.settings.settings import Settings
 
 
 def plan(
     shapes: ShapeArguments = None,
     collection: CollectionOption = None,
-    confidence: Annotated[float, typer.Option("--confidence", help="Chance of being right that is asked for.")] = 0.95,
-    precision: Annotated[float, typer.Option("--precision", help="Relative error of A and of P asked for.")] = 0.05,
+    confidence: ConfidenceOption = 0.95,
+    precision: Annotated[
+        float, typer.Option("--precision", min=0, max=1, help="Relative error of A and of P asked for.")
+    ] = 0.05,
     speed: Annotated[float | None, typer.Option("--speed", help="Cruising speed, cm/s.")] = None,
     arena: Annotated[
         str | None, typer.Option("--arena", metavar="SIZE", help="150x100 or disc:50 (the radius), cm between walls.")
@@ -31,19 +32,25 @@ def plan(
     robots: Annotated[int, typer.Option("--robots", min=1, max=8, help="On the floor at once.")] = 1,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random lines.")] = 1,
     font: FontOption = None,
+    quiet: QuietFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Say how many crossing lines, arena runs and hours each SHAPE will need, and how many charges.
+    """Say how many lines, runs and hours each SHAPE will need. Lines that cross it, runs of the arena; and charges.
 
     The shapes are told from the entries of --collection (the paper's six by default); without SHAPE, all of them.
 
     Example: chordlab plan eiffel --confidence 0.95 --precision 0.05 --speed 15 --arena 150x100
     """
+    import numpy as np
+
+    from lab.plan import plan as plan_sessions
+    from projector.collections import load_dictionary
+
     settings = _settings(speed, arena, robots)
     dictionary = load_dictionary(collection or PAPER, font=font)
     named = chosen_shapes(shapes, None, font)
     dictionary |= {shape.name: shape for shape in named if shape.name not in dictionary}
-    with progress_bar("entries", quiet=as_json) as update:
+    with progress_bar("entries", quiet=quiet) as update:
         found = plan_sessions(
             named or list(dictionary.values()),
             dictionary,
@@ -60,6 +67,8 @@ def plan(
 
 
 def _settings(speed: float | None, arena: str | None, robots: int) -> Settings:
+    from lab.settings.load import load_settings
+
     chosen: dict[str, Any] = {"robot": ["virtual"] * robots, "camera": "none"}
     if speed is not None:
         chosen["motion.speed_cm_s"] = speed
@@ -94,6 +103,8 @@ def _figures(found: Plan, settings: Settings) -> dict[str, Any]:
 
 
 def _show(found: Plan) -> None:
+    from analysis.report.words import signed
+
     pace = found.pace
     for entry in found.entries:
         show_table(
@@ -103,8 +114,8 @@ def _show(found: Plan) -> None:
         )
         if max(abs(entry.sensor_area_rel), abs(entry.sensor_perimeter_rel)) > found.precision:
             say(
-                f"{entry.name}: the light sensor alone puts {100 * entry.sensor_area_rel:+.1f} % on A and "
-                f"{100 * entry.sensor_perimeter_rel:+.1f} % on P; more lines do not mend that"
+                f"{entry.name}: the light sensor alone puts {signed(100 * entry.sensor_area_rel)} % on A and "
+                f"{signed(100 * entry.sensor_perimeter_rel)} % on P; more lines do not mend that"
             )
     together = f"{pace.robots} robots" if pace.robots > 1 else "one robot"
     say("in brackets: enough for 90 sessions of 100")

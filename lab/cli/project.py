@@ -6,23 +6,20 @@ import asyncio
 from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import typer
 
 from lab.base.errors import RequestError
-from lab.bench.devices import keep_alive
-from lab.bench.pictures import Picture, check_on_floor, draw_pictures
-from lab.bench.rigcheck import rig_picture
 from lab.cli.choosing import FontOption, ShapeArgument
+from lab.cli.completing import projectors, settings_files
 from lab.cli.output import JsonFlag, emit, say
-from lab.clock import run
-from lab.settings.load import load_settings
-from lab.settings.settings import Settings
-from projector.device import ProjectorDevice, ProjectorError, open_projector
-from projector.dictionary import shape_from
-from projector.shape import Shape
+
+if TYPE_CHECKING:
+    from lab.bench.pictures import Picture
+    from lab.settings.settings import Settings
+    from projector.device import ProjectorDevice
+    from projector.shape import Shape
 
 
 class Ring(StrEnum):
@@ -35,10 +32,17 @@ class Ring(StrEnum):
 def project(
     shape: ShapeArgument,
     projector: Annotated[
-        str | None, typer.Option(help="display:N, or image:DIR for a PNG; none: what the settings say.")
+        str | None,
+        typer.Option(help="display:N, or image:DIR for a PNG; none: what the settings say.", autocompletion=projectors),
     ] = None,
     settings_file: Annotated[
-        Path | None, typer.Option("--settings", metavar="SESSION.toml", help="Arena, and where the projector hangs.")
+        Path | None,
+        typer.Option(
+            "--settings",
+            metavar="SESSION.toml",
+            help="Arena, and where the projector hangs.",
+            autocompletion=settings_files,
+        ),
     ] = None,
     ring: Annotated[Ring | None, typer.Option(help="With a ring along the wall: dark or bright.")] = None,
     fiducials: Annotated[bool, typer.Option("--fiducials", help="With the markers of the rig check.")] = False,
@@ -46,10 +50,16 @@ def project(
     font: FontOption = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Hold a shape on the projector, at its true size in the plane of the light sensor, until Ctrl-C.
+    """Hold a shape on the projector, at its true size. In the plane of the light sensor, until Ctrl-C.
 
     Example: chordlab project eiffel --projector display:1 --settings bench.toml
     """
+    from lab.bench.pictures import check_on_floor
+    from lab.clock import run
+    from lab.settings.load import load_settings
+    from projector.dictionary import shape_from
+    from projector.opening import open_projector
+
     changes: dict[str, Any] = {"camera": "none"}
     if ring is not None:
         changes["arena.edge"] = f"{ring}_ring"
@@ -73,6 +83,8 @@ def project(
 
 def _device_of(settings_file: Path | None) -> str:
     """The projector that the file names; a virtual one would show nothing to anybody."""
+    from lab.settings.load import load_settings
+
     device = "virtual" if settings_file is None else load_settings(settings_file).projector
     if device == "virtual":
         raise RequestError("a virtual projector shows nothing to people; give --projector display:0, or image:DIR")
@@ -80,6 +92,11 @@ def _device_of(settings_file: Path | None) -> str:
 
 
 def _picture(shape: Shape, settings: Settings, light: ProjectorDevice, *, fiducials: bool) -> Picture:
+    import numpy as np
+
+    from lab.bench.pictures import draw_pictures
+    from lab.bench.rigcheck import rig_picture
+
     hangs = settings.projector_optics
     if hangs.calibration is None:  # measured by hand: it holds for any display that fills the same field
         hangs = hangs.model_copy(update={"image_size": light.image_size})
@@ -93,6 +110,9 @@ def _picture(shape: Shape, settings: Settings, light: ProjectorDevice, *, fiduci
 
 async def _hold(light: ProjectorDevice, seconds: float | None) -> None:
     """Keep the window up. Raises ProjectorError when it closes by itself."""
+    from lab.bench.devices import keep_alive
+    from projector.device import ProjectorError
+
     with suppress(TimeoutError):
         async with asyncio.timeout(seconds):
             await keep_alive(light)

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
-from analysis.quadrature import Moments, exact_moments
-from analysis.reading import Measured, measured_both_ways
 from lab.base.errors import RequestError
-from lab.cli.choosing import FontOption
-from lab.cli.output import JsonFlag, emit, lines_needed, progress_bar, say, show_table
-from lab.recognise.reading import reading_strategies
-from lab.recognise.recognisers import sensor_model
-from lab.settings.settings import Settings
-from projector.dictionary import load_dictionary, shape_from
-from projector.text import TEXT_PREFIX
+from lab.cli.choosing import ConfidenceOption, FontOption
+from lab.cli.output import JsonFlag, QuietFlag, emit, lines_needed, progress_bar, say, show_table
+
+if TYPE_CHECKING:
+    from analysis.quadrature import Moments
+    from analysis.reading import Measured
 
 
 def show_reading(
@@ -25,18 +21,29 @@ def show_reading(
     lines: Annotated[
         int, typer.Option("--lines", min=1, max=10**8, help="Crossing lines, all letters together.")
     ] = 300,
-    confidence: Annotated[float, typer.Option("--confidence", help="Chance of being right that is asked for.")] = 0.95,
+    confidence: ConfidenceOption = 0.95,
     sensor: Annotated[bool, typer.Option("--sensor", help="Through the default robot's sensor, not ideally.")] = False,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random lines.")] = 1,
     font: FontOption = None,
+    quiet: QuietFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Compare two ways to read a word: as one shape, and letter by letter.
+    """Read a word as one shape or letter by letter: compare.
 
     P and A with their errors, both ways; and from how many words on the letters take fewer lines.
 
     Example: chordlab shapes reading FREEDOM
     """
+    import numpy as np
+
+    from analysis.quadrature import exact_moments
+    from analysis.reading import measured_both_ways
+    from lab.recognise.reading import reading_strategies
+    from lab.recognise.recognisers import sensor_model
+    from lab.settings.settings import Settings
+    from projector.dictionary import load_dictionary, shape_from
+    from projector.text import TEXT_PREFIX
+
     model = sensor_model(Settings()) if sensor else None
     known = load_dictionary("letters", font=font)
     unknown = sorted({letter for letter in word if TEXT_PREFIX + letter not in known})
@@ -48,7 +55,7 @@ def show_reading(
     }
     measured = measured_both_ways(whole, [(letter, own[letter]) for letter in word], lines, name=word)
     rng = np.random.default_rng(seed)
-    with progress_bar("shapes", quiet=as_json) as update:
+    with progress_bar("shapes", quiet=quiet) as update:
         strategies = reading_strategies(word, rng, confidence=confidence, model=model, font=font, progress=update)
     if as_json:
         emit(

@@ -5,25 +5,30 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lab.cli.output import JsonFlag, emit, say, show_table
-from lab.reopen.recover import Recovery
-from lab.reopen.recover import recover as mend
-from lab.store.writer import disk_faults
+from lab.cli.completing import sessions
+from lab.cli.output import JsonFlag, QuietFlag, emit, say, show_table
+
+if TYPE_CHECKING:
+    from lab.reopen.recover import Recovery
 
 
 def recover(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A session folder.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A session folder.", autocompletion=sessions)],
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what is to be done, and leave it.")] = False,
+    quiet: QuietFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
     """Mend a session's folder after a kill or a power cut. Nothing is deleted.
 
     Example: chordlab recover sessions/2026-11-23T1042_eiffel_ab12
     """
+    from lab.reopen.recover import recover as mend
+    from lab.store.writer import disk_faults
+
     with disk_faults(folder):
         found = mend(folder, dry_run=dry_run)
     if as_json:
@@ -31,11 +36,11 @@ def recover(
         return
     for what in found.done:
         say(f"{'to be done: ' if dry_run else ''}{what}")
-    if not found.done:
+    if not (found.done or quiet):
         say("nothing to mend")
     for what in found.changed:
         say(f"not as SHA256SUMS says: {what}")
-    if found.state:  # else the log cannot be looked at before the manifest is in its place
+    if found.state and not quiet:  # else the log cannot be looked at before the manifest is in its place
         show_table(f"{folder.name}: {found.state}", ("", ""), _rows(found))
 
 
@@ -62,6 +67,8 @@ def in_ranges(numbers: Sequence[int]) -> str:
 
 
 def _plain(found: Recovery, *, dry_run: bool) -> dict[str, Any]:
+    from lab.reopen.recover import Recovery
+
     estimate = found.estimate
     figures = None if estimate is None else {
         "area_cm2": estimate.area_cm2,

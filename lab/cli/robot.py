@@ -9,29 +9,27 @@ from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
 from lab.base.errors import RequestError
-from lab.bench.pictures import check_on_floor, draw_pictures
-from lab.bench.world import virtual_world
+from lab.cli.completing import shapes
 from lab.cli.output import JsonFlag, emit, say, show_table
-from lab.clock import run
-from lab.settings.load import load_settings
-from projector.dictionary import shape_from
-from robot.bolt import Bolt, Heard, scan
-from robot.device import Sample
-from robot.profile import RobotProfile
-from robot.virtual.bolt import address_of
-from robot.virtual.hci_client import HciRadio
-from robot.virtual.hci_server import DEFAULT_ENDPOINT, HciServer, parse_endpoint
+
+if TYPE_CHECKING:
+    from robot.bolt import Bolt, Heard
+    from robot.device import Sample
+    from robot.virtual.hci_client import HciRadio
+
 
 app = typer.Typer(help="The robot alone: find it, ask it, drive it.", no_args_is_help=True)
 
 NameArgument = Annotated[
-    str, typer.Argument(metavar="NAME", help="The advertised name, such as SB-1234, or `virtual`.")
+    str,
+    typer.Argument(
+        metavar="NAME", help="The advertised name, such as SB-1234, or `virtual`.", autocompletion=lambda: ["virtual"]
+    ),
 ]
 HciOption = Annotated[
     str | None,
@@ -49,6 +47,8 @@ def scan_robots(
 
     Example: chordlab robot scan --seconds 5
     """
+    from lab.clock import run
+    from robot.bolt import scan
 
     async def listen() -> list[Heard]:
         async with _air(hci) as radio:
@@ -70,6 +70,7 @@ def info(name: NameArgument, hci: HciOption = None, as_json: JsonFlag = False) -
 
     Example: chordlab robot info virtual
     """
+    from lab.clock import run
 
     async def ask() -> dict[str, object]:
         async with _connected(name, hci) as robot:
@@ -92,10 +93,14 @@ def drive(
     hci: HciOption = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Roll straight for a while and stop; says how far it got by its own odometer.
+    """Roll straight for a while and stop. It says how far it got by its own odometer.
 
     Example: chordlab robot drive virtual --heading 90 --speed 20 --seconds 1
     """
+    import numpy as np
+
+    from lab.clock import run
+
     track: list[Sample] = []
     bumps: list[float] = []
 
@@ -121,12 +126,16 @@ def drive(
 @app.command("virtual")
 def virtual(
     hci: Annotated[
-        str, typer.Option("--hci", metavar="HOST:PORT", help="Where to serve; port 0 takes any that is free.")
-    ] = DEFAULT_ENDPOINT,
+        str | None,
+        typer.Option("--hci", metavar="HOST:PORT", help="Where to serve; port 0: a free one; none: 127.0.0.1:6402."),
+    ] = None,
     name: Annotated[str, typer.Option(help="The robot's name: SB- and four hexadecimal digits.")] = "SB-1234",
     seconds: Annotated[float | None, typer.Option(min=0.1, help="Stop after this long; none: at Ctrl-C.")] = None,
     shape: Annotated[
-        str | None, typer.Option(metavar="SHAPE", help="What is projected on its arena; none: a dark floor.")
+        str | None,
+        typer.Option(
+            metavar="SHAPE", help="What is projected on its arena; none: a dark floor.", autocompletion=shapes
+        ),
     ] = None,
     settings_file: Annotated[
         Path | None,
@@ -137,11 +146,21 @@ def virtual(
     ] = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Serve a virtual BOLT, in real time, to Bluetooth clients in other processes: HCI over TCP.
+    """Serve a virtual BOLT to other processes. In real time, to Bluetooth clients: HCI over TCP.
 
     Example: chordlab robot virtual --shape eiffel --name SB-1234
     """
-    host, port = parse_endpoint(hci)
+    import numpy as np
+
+    from lab.bench.pictures import check_on_floor, draw_pictures
+    from lab.bench.world import virtual_world
+    from lab.clock import run
+    from lab.settings.load import load_settings
+    from projector.dictionary import shape_from
+    from robot.virtual.bolt import address_of
+    from robot.virtual.hci_server import DEFAULT_ENDPOINT, HciServer, parse_endpoint
+
+    host, port = parse_endpoint(hci or DEFAULT_ENDPOINT)
     address = address_of(name)
     drawn = shape_from(shape) if shape is not None else None
     settings = load_settings(settings_file, {"camera": "none"}, simulate=True)
@@ -184,6 +203,8 @@ def virtual(
 @asynccontextmanager
 async def _air(hci: str | None) -> AsyncGenerator[HciRadio | None]:
     """The served air at ``hci``; None is the real one."""
+    from robot.virtual.hci_client import HciRadio
+
     if hci is None:
         yield None
         return
@@ -198,6 +219,13 @@ async def _air(hci: str | None) -> AsyncGenerator[HciRadio | None]:
 @asynccontextmanager
 async def _connected(name: str, hci: str | None) -> AsyncGenerator[Bolt]:
     """A connected robot, real, virtual or served; stopped and let go on every way out."""
+    import numpy as np
+
+    from lab.bench.world import virtual_world
+    from lab.settings.load import load_settings
+    from robot.bolt import Bolt
+    from robot.profile import RobotProfile
+
     if name == "virtual":
         if hci is not None:
             raise RequestError("`virtual` is a robot of this process; with --hci, name the one that is served there")

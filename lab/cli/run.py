@@ -9,49 +9,49 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
-import psutil
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from lab.base.errors import RequestError
-from lab.bench.replayed import replay_devices
-from lab.cli.output import JsonFlag, complain, emit, progress_bar, say
+from lab.cli.completing import collections, robots, sessions, settings_files, shapes
+from lab.cli.output import JsonFlag, QuietFlag, complain, emit, fail, progress_bar, say
 from lab.cli.paging import HostOption, LiveFlag, Paging, PortOption, SpeedOption, TokenOption, paging
 from lab.cli.recognize import read_letters
 from lab.live.server import LOOPBACK
-from lab.reopen.resume import cannot_go_on, pick_up
-from lab.reopen.resume import resume as resume_session
-from lab.review.review import review
-from lab.session.experiment import Finished, run_experiment
-from lab.session.ledger import Progress as Step
-from lab.session.ledger import Watcher
-from lab.settings.load import load_settings
-from lab.settings.settings import Settings
-from lab.store.lock import writing
-from lab.store.seal import write_checksums
-from lab.store.tables import finalize
-from projector.collections import charter_words
-from projector.text import TEXT_PREFIX
+
+if TYPE_CHECKING:
+    from lab.session.experiment import Finished
+    from lab.session.ledger import Progress as Step
+    from lab.session.ledger import Watcher
+    from lab.settings.settings import Settings
 
 
 def run(
-    session: Annotated[Path | None, typer.Argument(metavar="[SESSION.toml]", help="Settings; none: defaults.")] = None,
+    session: Annotated[
+        Path | None,
+        typer.Argument(metavar="[SESSION.toml]", help="Settings; none: defaults.", autocompletion=settings_files),
+    ] = None,
     simulate: Annotated[bool, typer.Option("--simulate", help="On the virtual bench, whatever the file says.")] = False,
     robot: Annotated[
         list[str] | None,
-        typer.Option(metavar="ROBOT", help="ble:SB-1234, onboard:CL-1234 or virtual; once for each robot."),
+        typer.Option(
+            metavar="ROBOT", help="ble:SB-1234, onboard:CL-1234 or virtual; once for each robot.", autocompletion=robots
+        ),
     ] = None,
     shape: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="SHAPE", help="A dictionary name, text:WORD, or a shape file; several: a session for each."
+            metavar="SHAPE",
+            help="A dictionary name, text:WORD, or a shape file; several: a session for each.",
+            autocompletion=shapes,
         ),
     ] = None,
     dictionary: Annotated[
-        str | None, typer.Option(help="What to choose the name from: paper, monuments, letters, words or all.")
+        str | None,
+        typer.Option(
+            help="What to choose the name from: paper, monuments, letters, words or all.", autocompletion=collections
+        ),
     ] = None,
     lines: Annotated[int | None, typer.Option(help="Stop after this many lines that cross the shape.")] = None,
     until: Annotated[float | None, typer.Option(help="Stop once the leading posterior reaches this.")] = None,
@@ -63,24 +63,34 @@ def run(
     no_video: Annotated[bool, typer.Option("--no-video", help="Without a camera.")] = False,
     resume: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Go on with a stored session, in its folder, to --lines; as it was begun."),
+        typer.Option(
+            metavar="DIR",
+            help="Go on with a stored session, in its folder, to --lines; as it was begun.",
+            autocompletion=sessions,
+        ),
     ] = None,
     replay: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Play a stored session back, as it was set or with other options."),
+        typer.Option(
+            metavar="DIR",
+            help="Play a stored session back, as it was set or with other options.",
+            autocompletion=sessions,
+        ),
     ] = None,
     live: LiveFlag = False,
     host: HostOption = LOOPBACK,
     port: PortOption = 0,
     token: TokenOption = None,
     speed: SpeedOption = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Only the report's path, and errors.")] = False,
+    quiet: QuietFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Run a full lab session and report on it; the report's path is printed last.
+    """Run a full lab session and report on it. The report's path is printed last.
 
     Example: chordlab run --simulate --shape eiffel --lines 150 --seed 1
     """
+    from lab.bench.replayed import replay_devices
+
     begun = {
         "robot": robot or None,
         "shape": shape[0] if shape else None,
@@ -121,7 +131,7 @@ def run(
             _run_several(settings_of_each, page, quiet=quiet, as_json=as_json)
 
 
-Told = tuple[Finished, dict[str, Any], dict[str, float]]
+Told: TypeAlias = "tuple[Finished, dict[str, Any], dict[str, float]]"
 """A session that is over: how it ended, its figures, and how fast the virtual bench was."""
 
 
@@ -177,6 +187,8 @@ def _refuse_with_resume(folder: Path, given: list[str]) -> None:
 
 def _run_one(settings: Settings, page: Paging, *, quiet: bool, next_shape: str = "") -> Told:
     """One session and its review; ``next_shape`` comes after it."""
+    from lab.session.experiment import run_experiment
+
     began_s = time.perf_counter()
     with _session_bar(settings, quiet=quiet) as (watch, tell):
         live = page.live(settings, tell, next_shape=next_shape)
@@ -186,6 +198,11 @@ def _run_one(settings: Settings, page: Paging, *, quiet: bool, next_shape: str =
 
 def _go_on(folder: Path, lines: int | None, until: float | None, page: Paging, *, quiet: bool) -> Told:
     """Go on with a session and review the whole of it; one that is complete is reviewed again."""
+    from lab.reopen.resume import pick_up
+    from lab.reopen.resume import resume as resume_session
+    from lab.session.experiment import Finished
+    from lab.store.lock import writing
+
     began_s = time.perf_counter()
     with writing(folder):
         unfinished = pick_up(folder, lines=lines, until=until, say=complain)
@@ -203,8 +220,13 @@ def _go_on(folder: Path, lines: int | None, until: float | None, page: Paging, *
 def _concluded(finished: Finished, settings: Settings, began_s: float, *, quiet: bool, earlier_s: float = 0.0) -> Told:
     """What comes after the rolling: say how it went, track, report, seal."""
     rolled_s = time.perf_counter() - began_s
+    from lab.reopen.resume import cannot_go_on
+    from lab.review.review import review
+    from lab.store.seal import write_checksums
+    from lab.store.tables import finalize
+
     if finished.failure is not None:
-        complain(f"chordlab: {finished.failure}")
+        fail(str(finished.failure))
     if finished.interrupted:
         tables = finalize(finished.folder)
         further = "read them: chordlab validate" if cannot_go_on(settings) else "go on: chordlab run --resume"
@@ -221,6 +243,9 @@ def _concluded(finished: Finished, settings: Settings, began_s: float, *, quiet:
 
 def _run_letters(settings: Settings, page: Paging, *, quiet: bool, as_json: bool) -> None:
     """A session for each letter of the word, in a folder of the word's name; then what they spell."""
+    from projector.collections import charter_words
+    from projector.text import TEXT_PREFIX
+
     word = settings.shape.removeprefix(TEXT_PREFIX)
     if word == settings.shape or len(word) < 2:
         raise RequestError(f"--letters is for a word: give --shape {TEXT_PREFIX}WORD")
@@ -237,7 +262,7 @@ def _run_letters(settings: Settings, page: Paging, *, quiet: bool, as_json: bool
             raise typer.Exit(1)
         if page.stopped:
             break
-    read_letters(folders, charter_words(), settings.dictionary, as_json=as_json)
+    read_letters(folders, charter_words(), settings.dictionary, quiet=quiet, as_json=as_json)
 
 
 def _tell(summary: dict[str, Any], ratios: dict[str, float], *, quiet: bool) -> None:
@@ -251,6 +276,8 @@ def _tell(summary: dict[str, Any], ratios: dict[str, float], *, quiet: bool) -> 
 def _settings(
     session: Path | None, simulate: bool, no_video: bool, flags: dict[str, Any], base: dict[str, Any] | None
 ) -> Settings:
+    from lab.settings.load import load_settings
+
     overrides = {
         key: str(value) if isinstance(value, Path) else value for key, value in flags.items() if value is not None
     }
@@ -270,11 +297,13 @@ def _ratios(finished: Finished, settings: Settings, rolled_s: float, earlier_s: 
 
 def _peak_memory_mb() -> float:
     """Largest resident memory of this process so far, MB."""
+    import psutil
+
     info = psutil.Process().memory_info()
     peak: int | None = getattr(info, "peak_wset", None)  # Windows
     if peak is not None:
         return peak / 1e6
-    import resource  # noqa: PLC0415 - not on Windows
+    import resource
 
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
@@ -283,6 +312,9 @@ def _peak_memory_mb() -> float:
 @contextmanager
 def _session_bar(settings: Settings, *, quiet: bool, done: int = 0) -> Generator[tuple[Watcher, Callable[[str], None]]]:
     """Progress on stderr: lines, A ± , P ±, the leading name and its posterior, battery, time left; and what to say."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
     console = Console(stderr=True, quiet=quiet)
     columns = (
         TextColumn("line {task.completed}/{task.total}"),

@@ -4,44 +4,58 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
-from analysis.figures.separability import separability_figure
-from analysis.figures.style import save_figure
-from analysis.figures.values import Entry
-from lab.cli.choosing import CollectionOption, FontOption, ShapeArguments, chosen_shapes, leaving, picture_path
-from lab.cli.output import JsonFlag, emit, lines_needed, progress_bar, say, show_table
-from lab.recognise.recognisers import sensor_model
-from lab.recognise.separability import PairProspects, Prospect, Separability, separability
-from lab.settings.settings import Settings
-from projector.collections import PAPER
-from projector.dictionary import Shape
+from lab.cli.choosing import (
+    CollectionOption,
+    ConfidenceOption,
+    FontOption,
+    ShapeArguments,
+    chosen_shapes,
+    leaving,
+    picture_path,
+)
+from lab.cli.output import JsonFlag, QuietFlag, emit, lines_needed, progress_bar, say, show_table
+from projector.catalogue import PAPER
+
+if TYPE_CHECKING:
+    from lab.recognise.separability import PairProspects, Prospect, Separability
+    from projector.dictionary import Shape
 
 
 def show_separability(
     shapes: ShapeArguments = None,
     collection: CollectionOption = None,
     lines: Annotated[int, typer.Option("--lines", min=1, max=10**8, help="Crossing lines N.")] = 100,
-    confidence: Annotated[float, typer.Option("--confidence", help="Chance of being right that is asked for.")] = 0.95,
+    confidence: ConfidenceOption = 0.95,
     sensor: Annotated[bool, typer.Option("--sensor", help="Through the default robot's sensor, not ideally.")] = False,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the random lines.")] = 1,
     font: FontOption = None,
     out: Annotated[Path | None, typer.Option("--out", help="Plot of the (P, A) plane, .svg, .png or .pdf.")] = None,
+    quiet: QuietFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Say which entries are confusable after N lines, and how many lines each needs.
+    """Say which entries are confusable after N lines. And how many lines each needs.
 
     Twice: by (P, A), as in the paper, and line by line, as a session recognises. Mirror twins are one class.
 
     Example: chordlab shapes separability --collection letters --lines 1000 --out letters.svg
     """
+    import numpy as np
+
+    from analysis.figures.separability import separability_figure
+    from analysis.figures.style import save_figure
+    from analysis.figures.values import Entry
+    from lab.recognise.recognisers import sensor_model
+    from lab.recognise.separability import separability
+    from lab.settings.settings import Settings
+
     target = picture_path(out) if out else None
     chosen = chosen_shapes(shapes, collection or (None if shapes else PAPER), font)
     dictionary = {shape.name: shape for shape in chosen}
-    with progress_bar("entries", quiet=as_json) as update:
+    with progress_bar("entries", quiet=quiet) as update:
         found = separability(
             dictionary,
             np.random.default_rng(seed),
@@ -68,7 +82,8 @@ def show_separability(
             }
         )
         return
-    _show_separability(found)
+    if target is None or not quiet:
+        _show_separability(found)
     if target is not None:
         say(str(target))
 
@@ -78,6 +93,8 @@ def _label(shape: Shape) -> str:
 
 
 def _show_separability(found: Separability) -> None:
+    import numpy as np
+
     show_table(
         f"After {found.n} lines, and lines for {100 * found.confidence:g} % right",
         ("entry", "(P, A): right", "lines", "taken for", "by line: right", "lines", "taken for"),

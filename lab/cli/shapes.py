@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,24 +11,20 @@ from lab.base.errors import RequestError
 from lab.cli.choosing import (
     CollectionOption,
     FontOption,
-    ShapeArgument,
     ShapeArguments,
     chosen_shapes,
     leaving,
     picture_path,
 )
 from lab.cli.learn import learn
-from lab.cli.output import JsonFlag, emit, say, show_table
+from lab.cli.output import JsonFlag, QuietFlag, emit, say, show_table
 from lab.cli.reading import show_reading
 from lab.cli.separability import show_separability
-from lab.settings.sections import ArenaSettings
-from projector.collections import DRAWN, PAPER, drawn_files
-from projector.dictionary import Shape, load_dictionary
-from projector.draw import draw_gallery, draw_shape
-from projector.geojson import write_shape
-from projector.importers import import_shape
+from projector.catalogue import DRAWN, PAPER, drawn_files
 
-__all__ = ["FontOption", "ShapeArgument", "app"]
+if TYPE_CHECKING:
+    from projector.dictionary import Shape
+
 
 app = typer.Typer(help="The dictionary of shapes.", no_args_is_help=True)
 
@@ -37,10 +33,12 @@ _SAID = 6  # shapes whose figures are printed beside their picture
 
 @app.command("list")
 def list_shapes(collection: CollectionOption = PAPER, font: FontOption = None, as_json: JsonFlag = False) -> None:
-    """List a collection of the dictionary with each entry's figures.
+    """List a collection with each entry's figures.
 
     Example: chordlab shapes list --collection monuments
     """
+    from projector.dictionary import load_dictionary
+
     entries = load_dictionary(collection or PAPER, font=font).values()
     if as_json:
         emit({"collection": collection, "shapes": [_figures(entry) for entry in entries]})
@@ -60,12 +58,15 @@ def show(
     out: Annotated[
         Path | None, typer.Option("--out", help="Picture to write, .png, .svg or .pdf. Default: NAME.png here.")
     ] = None,
+    quiet: QuietFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Draw one shape to scale, or several in one gallery, with area and perimeter.
+    """Draw shapes to scale. One, or several in one gallery, with area and perimeter.
 
     Example: chordlab shapes show --collection letters --out letters.png
     """
+    from projector.draw import draw_gallery, draw_shape
+
     chosen = chosen_shapes(shapes, collection, font)
     if not chosen:
         raise RequestError("nothing to show; name a shape, or give --collection monuments")
@@ -78,6 +79,9 @@ def show(
     if as_json:
         figures = [_figures(shape) for shape in chosen]
         emit({**figures[0], "picture": target} if len(chosen) == 1 else {"shapes": figures, "picture": target})
+        return
+    if quiet:
+        say(str(target))
         return
     for drawn in chosen if len(chosen) <= _SAID else []:
         say(f"{drawn.title}: A = {drawn.area_cm2:.1f} cm², P = {drawn.perimeter_cm:.1f} cm")
@@ -107,14 +111,19 @@ def import_file(
     font: FontOption = None,
     out: Annotated[Path | None, typer.Option("--out", help="GeoJSON to write. Default: NAME.geojson here.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Write over a file that is there.")] = False,
+    quiet: QuietFlag = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Make a shape in cm from a drawing, a picture or a text, checked and centred, as a GeoJSON file.
+    """Make a shape from a drawing, picture or text. In cm, checked and centred, as a GeoJSON file.
 
     Without a size a file that states one keeps it; anything else is fitted into 100 x 70 cm.
 
     Example: chordlab shapes import tower.svg --name tower --height 70
     """
+    from lab.settings.sections import ArenaSettings
+    from projector.geojson import write_shape
+    from projector.importers import import_shape
+
     taken = {known for collection in DRAWN for known in drawn_files(collection)}
     made = import_shape(
         file,
@@ -138,6 +147,9 @@ def import_file(
         write_shape(made.shape, target)
     if as_json:
         emit({**_figures(made.shape), "notes": made.notes, "file": target})
+        return
+    if quiet:
+        say(str(target))
         return
     width_cm, height_cm = made.shape.size_cm
     say(

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from analysis.figures.paper.explored import blinks_panel, chords_panel, evolution_panel, way_panel
+from analysis.figures.paper.needed import crowd_panel, letters_panel, needed_panel, words_panel
 from analysis.figures.paper.panel import PANELS, PaperPanel, write_panel
-from analysis.figures.paper.plane import crowd_panel, domains_panel, letters_panel, needed_panel, window_of, words_panel
+from analysis.figures.paper.plane import domains_panel, window_of
 from analysis.figures.paper.precision import complexity_panel, scatter_panel
 from analysis.figures.paper.word import global_panel, letters_plane_panel, local_panel, whole_plane_panel
 from analysis.tablestore import Mapper

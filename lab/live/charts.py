@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -186,21 +187,28 @@ def runs(rolled: Sequence[Rolled], ink: Ink) -> Options:
     }
 
 
-def light_strip(samples: Sequence[tuple[float, float]], ink: Ink) -> Options:
-    """The newest light samples, (t, lux)."""
-    end_s = samples[-1][0] if samples else 0.0
+def light_strip(light: Mapping[str, Sequence[tuple[float, float]]], ink: Ink) -> Options:
+    """Each robot's newest light samples, (t_s, lux); several are told apart by colour and by their strokes."""
+    end_s = max((samples[-1][0] for samples in light.values() if samples), default=0.0)
+    looks = itertools.cycle(itertools.product(("solid", "dashed", "dotted"), (ink.second, ink.first)))
+    several = len(light) > 1
+    lines: list[Options] = [
+        {
+            "type": "line",
+            "name": robot,
+            "symbol": "none",
+            "lineStyle": {"color": colour, "width": 2, "type": stroke},
+            "itemStyle": {"color": colour},
+            "data": [[round(t_s - end_s, 2), lux] for t_s, lux in samples if t_s > end_s - 20],
+        }
+        for (robot, samples), (stroke, colour) in zip(light.items(), looks, strict=False)
+    ]
+    legend = {"show": several, "right": 8, "top": 0, "textStyle": {"color": ink.text, "fontSize": ink.text_px}}
     return _framed(ink) | {
+        "legend": legend,
         "xAxis": _along(ink, "s before now", -20, 0),
         "yAxis": _axis(ink, "lux", 0),
-        "series": [
-            {
-                "type": "line",
-                "name": "light",
-                "symbol": "none",
-                "lineStyle": {"color": ink.second, "width": 2},
-                "data": [[round(t_s - end_s, 2), lux] for t_s, lux in samples if t_s > end_s - 20],
-            }
-        ],
+        "series": lines,
     }
 
 
@@ -241,7 +249,7 @@ def _framed(ink: Ink) -> Options:
     return {
         "animation": False,
         "textStyle": {"color": ink.text, "fontSize": ink.text_px},
-        "grid": {"left": 10, "right": 26, "top": 34, "bottom": 30, "containLabel": True},
+        "grid": {"left": 10, "right": 26, "top": 2.6 * ink.text_px, "bottom": 2.4 * ink.text_px, "containLabel": True},
     }
 
 

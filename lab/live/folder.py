@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from lab.recognise.recognisers import recogniser_for
 from lab.reopen.stored import stored_settings, stored_shape
 from lab.session.experiment import dictionary_with
 from lab.settings.settings import Settings
-from lab.store.layout import EVENTS, LIGHT, SessionFolderError
+from lab.store.layout import LIGHT, REPORT, SessionFolderError
 from lab.store.reader import SessionReader
 from projector.shape import Shape
 
@@ -39,13 +39,24 @@ class Sightings:
     y_cm: Floats
     lit: NDArray[np.bool_]
 
+    @staticmethod
+    def of(places: Iterable[tuple[float, float, float, bool]]) -> Sightings:
+        """From (t_s, x_cm, y_cm, lit), in any order."""
+        t_s, x_cm, y_cm, lit = np.array(sorted(places), dtype=float).reshape(-1, 4).T
+        return Sightings(t_s, x_cm, y_cm, lit > 0)
+
+    def and_then(self, places: Iterable[tuple[float, float, float, bool]]) -> Sightings:
+        """Those, and later ones."""
+        more = Sightings.of(places)
+        return Sightings(*(np.concatenate([getattr(one, name) for one in (self, more)]) for name in self.__slots__))
+
     def until(self, t_s: float) -> Sightings:
         """Those up to a time."""
         end = int(np.searchsorted(self.t_s, t_s, side="right"))
         return Sightings(self.t_s[:end], self.x_cm[:end], self.y_cm[:end], self.lit[:end])
 
 
-NOTHING_SEEN = Sightings(np.empty(0), np.empty(0), np.empty(0), np.empty(0, dtype=bool))
+NOTHING_SEEN = Sightings.of(())
 
 
 class StoryFolder:
@@ -68,7 +79,7 @@ class StoryFolder:
         self.truth: Moments = exact_moments(self.shape.geometry)
         self.story = Story(self._lines())
         self.story.begin(self._batteries())
-        self._read_bytes = -1
+        self._read_bytes = 0
         self._recogniser: Recogniser | None = None
         self._samples: dict[int, int] = {}
 
@@ -79,27 +90,22 @@ class StoryFolder:
         return devices.get("camera") is not None
 
     def read(self) -> bool:
-        """Take what the log has gained. Whether it has gained anything.
+        """Take what the log has gained, which alone is read. Whether it has gained anything.
 
         Raises:
             SessionFolderError: the log was changed, or is not whole.
         """
+        gained = False
         try:
-            size = self.session.path(EVENTS).stat().st_size
-        except OSError as error:
-            raise SessionFolderError(self.session.folder, f"{EVENTS} cannot be read: {error.strerror}") from error
-        if size == self._read_bytes:
-            return False
-        events = list(self.session.events())
-        before = self.story.events
-        try:
-            self.story.take(events[before:])
+            for event, read_bytes in self.session.events_from(self._read_bytes, self.story.events + 1):
+                self._read_bytes = read_bytes
+                self.story.take([event])
+                gained = True
         except (KeyError, TypeError, ValueError) as error:
             raise SessionFolderError(self.session.folder, f"an event of the log is not whole ({error!r})") from error
-        self._read_bytes = size
-        if self._recogniser is not None:
+        if gained and self._recogniser is not None:
             self.story.name_with(self._recogniser)
-        return len(events) > before
+        return gained
 
     def learn_names(self) -> bool:
         """Learn the dictionary, so that all entries' probabilities are shown; takes a while where it is not stored.
@@ -144,6 +150,12 @@ class StoryFolder:
             return Sightings(t_s[seen], x_cm[seen], y_cm[seen], lit[seen] > 0)
         except (OSError, ValueError, TypeError, KeyError, SessionFolderError):
             return NOTHING_SEEN
+
+    @property
+    def report(self) -> Path | None:
+        """The session's report, once it is written."""
+        path = self.session.folder / REPORT
+        return path if path.is_file() else None
 
     def outline_cm(self) -> list[Floats]:
         """The shape's rings, (n, 2) each, cm."""

@@ -67,5 +67,8 @@ class Live:
         self.controls.resume()
 
     def _take(self, command: Command) -> None:
+        if command.get("do") == "look":
+            self.feed.look()
+            return
         self.controls.take(command)
         self.feed.tell(paused=self.controls.paused, stopping=self.controls.stop_asked)

@@ -29,9 +29,9 @@ def arena_svg(arena: Polygon, outline_cm: Sequence[Floats], seen: Sightings, *, 
     step = max(1, -(-len(seen.t_s) // _MOST_SPOTS))
     x_cm, y_cm, lit = seen.x_cm[::step], seen.y_cm[::step], seen.lit[::step]
     here = ""
-    if len(seen.t_s):
-        kind = "lit" if seen.lit[-1] else "dark"
-        here = f'<circle class="here {kind}" cx="{seen.x_cm[-1]:.1f}" cy="{-seen.y_cm[-1]:.1f}" r="3"/>'
+    for last in np.flatnonzero(seen.t_s == seen.t_s[-1]) if len(seen.t_s) else ():
+        kind = "lit" if seen.lit[last] else "dark"
+        here += f'<circle class="here {kind}" cx="{seen.x_cm[last]:.1f}" cy="{-seen.y_cm[last]:.1f}" r="3"/>'
     return (
         f'<svg class="arena" role="img" aria-label="{label}" '
         f'viewBox="{left - _MARGIN_CM:g} {-top - _MARGIN_CM:g} {width:g} {height:g}">'

@@ -177,13 +177,14 @@ class Story:
         if recogniser is not self._recogniser:
             recogniser.reset()
             self._recogniser, self._named = recogniser, 0
-        for row in range(self._named, len(self.standings)):
+        end = len(self.standings)  # more may come meanwhile
+        for row in range(self._named, end):
             event = self._crossed[row]
             if event["whole"]:
                 recogniser.update(event["k"], event["l1_cm"], event["l3_cm3"], event["weight"])
             names = tuple(recogniser.ranked()[:_MOST_NAMES])
             self.standings[row] = replace(self.standings[row], names=names, unknown=recogniser.unknown())
-        self._named = len(self.standings)
+        self._named = end
 
     def at(self, t_s: float) -> Moment:
         """What was known at a time; at infinity, all."""

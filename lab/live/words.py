@@ -11,12 +11,12 @@ _STATES = {
     "preparing": "Getting ready",
     "rolling": "Rolling",
     "paused": "Paused",
-    "complete": "Done: all lines are rolled",
-    "recognised": "Done: recognised",
+    "complete": "Complete: all lines are rolled",
+    "recognised": "Complete: recognised",
     "stopped": "Stopped",
     "interrupted": "Interrupted",
     "failed": "Failed",
-    "replayed": "Done: the replay has come to its end",
+    "replayed": "Complete: the replay has come to its end",
     "cut": "Cut off",
 }
 _SURENESS = ((0.99, "Surely"), (0.95, "Almost surely"), (0.8, "Probably"), (0.5, "Perhaps"))
@@ -76,7 +76,7 @@ def facts(
     left = "–" if moment.state not in ("rolling", "paused") else duration(moment.left_s)
     if speed and left != "–":
         left = f"{left} (here {duration(moment.left_s / speed)})"
-    volts = ", ".join(
+    volts = "\n".join(
         f"{value:.2f} V" if len(battery_v) == 1 else f"{robot} {value:.2f} V" for robot, value in battery_v.items()
     )
     return {

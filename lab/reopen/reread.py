@@ -17,7 +17,7 @@ from lab.reopen.rerun import Rerun
 from lab.reopen.stored import stored_shape
 from lab.session.experiment import dictionary_with
 from lab.session.ledger import Ledger
-from lab.session.roller import SessionLevels
+from lab.session.levels import SessionLevels
 from lab.session.tally import tally_for
 from lab.store.reader import SessionReader
 from lab.store.tables import Tables, tables_from

@@ -10,7 +10,7 @@ import pandas as pd
 
 from lab.base.errors import ChordlabError
 from lab.reopen.stored import stored_settings
-from lab.session.roller import SessionLevels
+from lab.session.levels import SessionLevels
 from lab.session.run import Run
 from lab.settings.settings import Settings
 from lab.store.layout import LIGHT, SessionFolderError

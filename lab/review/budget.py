@@ -270,7 +270,7 @@ def _anisotropy(filmed: Filmed, settings: Settings, geometry: Silhouette) -> Exp
     if filmed.isotropy is None:
         return None
     try:
-        bias = bias_from(filmed.isotropy, settings.arena.lines_within, geometry)
+        bias = bias_from(filmed.isotropy.evidence, settings.arena.lines_within, geometry)
     except TooFewHitsError:
         return None
     return Expected(

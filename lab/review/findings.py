@@ -16,6 +16,7 @@ from analysis.report.result import ENDED_WELL, RunCheck, SessionResult
 from analysis.report.verdict import verdict_of
 from lab.recognise.recognisers import Recognition
 from lab.review.filmed import Filmed
+from lab.review.history import history_of
 from lab.review.reviewed import Reviewed
 from lab.session.session import CONTACT_WINDOW_S
 from projector.shape import Silhouette
@@ -80,7 +81,7 @@ def _figures(found: Estimate | None) -> dict[str, Any] | None:
 
 def _isotropy_figures(isotropy: IsotropyReport, found: Reviewed) -> dict[str, Any]:
     try:
-        bias = bias_from(isotropy, found.settings.arena.lines_within, found.shape.geometry)
+        bias = bias_from(isotropy.evidence, found.settings.arena.lines_within, found.shape.geometry)
     except TooFewHitsError:
         bias = None
     return {
@@ -151,6 +152,7 @@ def to_result(found: Reviewed, host: Mapping[str, Any] | None = None) -> Session
             "settings": manifest.get("settings", {}),
             "versions": manifest.get("versions", {}),
         },
+        history=history_of(found.session.events()),
         warnings=_warnings(found),
     )
 
@@ -176,7 +178,12 @@ def _warnings(found: Reviewed) -> list[str]:
     said: list[str] = []
     state = found.session.manifest.get("end", {}).get("state", "cut short")
     if state not in ENDED_WELL:
-        said.append(f"The session ended early ({state}); what was recorded until then is whole.")
+        folder = found.session.folder.name
+        mend = f"`chordlab recover {folder}`, then " if state == "cut short" else ""
+        said.append(
+            f"The session ended early ({state}); what was recorded until then is whole. To go on with it: {mend}"
+            f"`chordlab run --resume {folder} --lines {found.settings.stop.lines}`."
+        )
     given_up = int(lines["ended"].isin(["timeout", "stall"]).sum())
     if given_up > 0.02 * len(lines):
         said.append(f"{given_up} of {len(lines)} runs reached no wall and are left out: was the robot stuck or lifted?")
@@ -189,7 +196,10 @@ def _warnings(found: Reviewed) -> list[str]:
     if found.filmed is not None:
         unseen = int(lines["counts"].sum()) - len(found.filmed.lines)
         if unseen > 0.05 * len(lines):
-            said.append(f"The camera could not follow {unseen} of {int(lines['counts'].sum())} runs.")
+            said.append(
+                f"The camera could not follow {unseen} of {int(lines['counts'].sum())} runs: is the whole arena in its "
+                "picture, and the LED brighter than the projected light?"
+            )
         if not found.filmed.health.honest:
             said.append(f"Of the camera's track: {found.filmed.health.verdict}.")
     return said

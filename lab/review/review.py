@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 from analysis.montecarlo import available_cores
 from analysis.quadrature import exact_moments
 from analysis.report.write import write_report
+from lab.base.errors import RequestError
 from lab.recognise.recognisers import Recognition, recognise_lines, recogniser_for
 from lab.reopen.stored import stored_settings, stored_shape
 from lab.review.budget import session_budget
@@ -68,13 +70,37 @@ def examine(folder: Path, *, workers: int | None = None, progress: Progress | No
     )
 
 
-def keep(found: Reviewed) -> None:
-    """Write the tables and the track of an examined session into its folder."""
+def keep(found: Reviewed, out: Path | None = None) -> None:
+    """Write the tables and the track of an examined session into its folder, or into ``out``.
+
+    Raises RequestError: ``out`` cannot be written.
+    """
+    if out is not None:
+        _keep_apart(found, out)
+        return
     folder = found.session.folder
     with writing(folder):
         finalize(folder)
         if found.filmed is not None:
             write_table(folder, "track", found.filmed.track)
+
+
+def _keep_apart(found: Reviewed, out: Path) -> None:
+    tables = {name: getattr(found.tables, name) for name in Tables.__slots__}
+    if found.filmed is not None:
+        tables["track"] = found.filmed.track
+    with _writable(out):
+        for name, table in tables.items():
+            write_table(out, name, table)
+
+
+@contextmanager
+def _writable(out: Path) -> Generator[None]:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        yield
+    except OSError as error:
+        raise RequestError(f"{out}: cannot be written ({error.strerror or error}); choose another --out") from error
 
 
 def recognition_of(session: SessionReader, tables: Tables, collection: str | None = None) -> Recognition:
@@ -92,13 +118,23 @@ def review(
     folder: Path,
     *,
     report: bool,
+    out: Path | None = None,
     host: Mapping[str, Any] | None = None,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Examine a session, keep its tables, write its report when asked, and give its figures (``report``: its path)."""
-    with writing(folder):
+    """Examine a session, keep its tables, write its report when asked, and give its figures (``report``: its path).
+
+    With ``out`` all that is written goes there and the session is left as it is; it may be read-only.
+
+    Raises RequestError: ``out`` cannot be written.
+    """
+    with writing(folder) if out is None else nullcontext():
+        if out is not None:
+            with _writable(out):  # told now and not after the film was tracked
+                pass
         found = examine(folder, workers=workers, progress=progress)
-        keep(found)
+        keep(found, out)
         result = to_result(found, host)
-        return {**summarise(found, result), "report": write_report(result, folder / REPORT) if report else None}
+        written = write_report(result, (out or folder) / REPORT) if report else None
+        return {**summarise(found, result), "report": written}

@@ -23,8 +23,8 @@ from lab.clock import run as run_on_clock
 from lab.live.live import Live
 from lab.recognise.recognisers import recogniser_for
 from lab.session.ledger import Ledger, Watcher
+from lab.session.levels import SessionLevels
 from lab.session.listening import Listening
-from lab.session.roller import SessionLevels
 from lab.session.session import NOTHING_EARLIER, Earlier, Outcome, Preflight, Session
 from lab.session.tally import Tally, tally_for
 from lab.settings.settings import Settings

@@ -17,8 +17,9 @@ from lab.bench.pictures import Picture
 from lab.bench.rigcheck import check_bench
 from lab.live.live import Live
 from lab.session.ledger import Ledger, Watcher
+from lab.session.levels import PlainLight
 from lab.session.roller import SessionError
-from lab.session.session import LEVEL_SAMPLES, Outcome, PlainLight, Preflight
+from lab.session.session import LEVEL_SAMPLES, Outcome, Preflight
 from lab.settings.settings import Settings
 from lab.store.writer import SessionWriter
 from robot.backoff import persist

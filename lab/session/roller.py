@@ -7,19 +7,21 @@ import contextlib
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from lab.base.colours import Rgb
 from lab.base.errors import ChordlabError
+from lab.session.blinker import Blinker
+from lab.session.levels import SessionLevels
 from lab.session.run import Run
 from lab.settings.settings import Settings
-from robot.crossings import CrossingDetector, Levels
+from robot.crossings import CrossingDetector
 from robot.device import Bump, Identity, RobotDevice, Sample
-from robot.edge import EdgeError, EdgeLevels, EdgePoint, FeltEdge, KnowsEdge, RingedDetector, feel_edge
+from robot.edge import EdgeLevels, EdgePoint, RingedDetector
 from robot.errors import LinkLostError, NotConnectedError, ReplyTimeoutError
+from robot.feeledge import EdgeError, FeltEdge, KnowsEdge, feel_edge
 from robot.turning import Leg, Navigator, Policy, navigator_for
 
 _log = logging.getLogger(__name__)
@@ -43,14 +45,6 @@ class Note(Protocol):
     def __call__(self, kind: str, text: str, **data: object) -> None:
         """Take note; ``text`` is one line for people, ``data`` goes into the log."""
         ...
-
-
-@dataclass(frozen=True, slots=True)
-class SessionLevels:
-    """The light levels of a session: of the shape, and of the ring where light marks the edge."""
-
-    shape: Levels
-    edge: EdgeLevels | None = None
 
 
 class Onlooker(Protocol):
@@ -97,7 +91,7 @@ class Roller:
         self._over = asyncio.Event()
         self._felt: FeltEdge | None = None
         self._listeners: list[Callable[[Sample], None]] = []
-        self._led_wanted = asyncio.Event()
+        self._blinker = Blinker(robot, settings.led, led_rgb, self._over_shape)
         self._lost = ""
         self._battery_read_s = 0.0
         self._longest_cm = settings.arena.longest_line_cm
@@ -174,7 +168,7 @@ class Roller:
         self._over.clear()
         self._felt = None
         self._run = run  # before it drives: on a short run the bump can come before the command's reply
-        self._led_wanted.set()  # a run that ended in the light left the LED lit
+        self._blinker.changed()  # a run that ended in the light left the LED lit
         try:
             async with asyncio.timeout(GIVE_UP_S):
                 await self.robot.drive(leg.heading_rad, run.speed_cm_s)
@@ -209,6 +203,13 @@ class Roller:
         if await self._rested() or moved:
             return self._navigator.first()
         return self._navigator.next(run.as_leg_end())
+
+    async def follow_with_led(self) -> None:
+        """Show by the LED whether the robot is over the shape, until cancelled."""
+        await self._blinker.follow()
+
+    def _over_shape(self) -> bool:
+        return self._run is not None and self._run.detector.lit
 
     async def halt(self) -> None:
         """Stop the robot, whatever state it is in."""
@@ -355,23 +356,6 @@ class Roller:
         self._battery_read_s = asyncio.get_running_loop().time()
         return called_back
 
-    async def follow_with_led(self) -> None:
-        """Keep the LED as the last crossing left it: a blink faster than the link can follow is skipped."""
-        led = self._settings.led
-        shown = led.dark_level
-        while True:
-            await self._led_wanted.wait()
-            self._led_wanted.clear()
-            run = self._run
-            wanted = led.lit_level if run is not None and run.detector.lit else led.dark_level
-            if wanted != shown:
-                try:
-                    await self.robot.set_led(wanted, self._led_rgb)
-                except ChordlabError as error:  # a missed blink costs the camera a label, not the session a line
-                    _log.warning("LED not set: %s", error)
-                else:
-                    shown = wanted
-
     def _on_sample(self, sample: Sample) -> None:
         for listener in tuple(self._listeners):
             listener(sample)
@@ -386,7 +370,7 @@ class Roller:
         lit = run.detector.lit
         run.feed(sample)
         if run.detector.lit != lit:
-            self._led_wanted.set()
+            self._blinker.changed()
         if run.entered is not None:
             self._finish(run, "edge", run.entered.t_s)
         elif run.arrived:

@@ -20,14 +20,13 @@ from lab.bench.pictures import Picture
 from lab.bench.rigcheck import check_bench
 from lab.live.live import Live
 from lab.session.ledger import Ledger, Watcher
-from lab.session.roller import Roller, SessionError, SessionLevels
+from lab.session.levels import PlainLight, SessionLevels
+from lab.session.roller import Roller, SessionError
 from lab.session.run import Run
 from lab.session.tally import Tally
 from lab.settings.settings import Settings
 from lab.store.writer import SessionWriter
-from robot.crossings import learn_levels
 from robot.device import Identity
-from robot.edge import learn_edge_levels
 from robot.errors import ReconnectError
 from robot.turning import Leg
 from tracking.recorder import Recorder
@@ -36,20 +35,6 @@ _log = logging.getLogger(__name__)
 
 LEVEL_SAMPLES = 20
 CONTACT_WINDOW_S = 0.05  # two reports of one contact, each with its latency; wider, walls met at once count too
-
-
-@dataclass(frozen=True, slots=True)
-class PlainLight:
-    """What one robot read under plain fields of light, in lux: what its levels were learnt from."""
-
-    floor: Sequence[float]
-    lit: Sequence[float]
-    ring: Sequence[float] | None
-
-    def levels(self) -> SessionLevels:
-        """The light levels. Raises LevelsError when they do not separate."""
-        edge = None if self.ring is None else learn_edge_levels(self.floor, self.lit, self.ring)
-        return SessionLevels(learn_levels(self.floor, self.lit), edge)
 
 
 @dataclass(frozen=True, slots=True)

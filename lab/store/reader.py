@@ -101,21 +101,28 @@ class SessionReader:
 
     def events(self) -> Iterator[dict[str, Any]]:
         """The events in order. A torn last record is left out; a torn one before it is an error."""
+        return (event for event, _ in self.events_from(0))
+
+    def events_from(self, byte: int, number: int = 1) -> Iterator[tuple[dict[str, Any], int]]:
+        """As `events`, from a byte of the log on, where record ``number`` begins; each with the byte after it."""
         try:
-            log = self.path(EVENTS).read_bytes()
+            with self.path(EVENTS).open("rb") as file:
+                file.seek(byte)
+                log = file.read()
         except OSError as error:
             raise SessionFolderError(self.folder, f"{EVENTS} cannot be read: {error.strerror}") from error
-        for number, record in enumerate(log[: whole_length(log)].split(b"\n")[:-1], start=1):
+        for line, record in enumerate(log[: whole_length(log)].split(b"\n")[:-1], start=number):
+            byte += len(record) + 1
             try:
                 event: Any = json_of(record)
             except ValueError as error:
                 raise SessionFolderError(
-                    self.folder, f"{EVENTS} line {number} is no JSON; the file was changed"
+                    self.folder, f"{EVENTS} line {line} is no JSON; the file was changed"
                 ) from error
             found = cast("dict[str, Any]", event) if isinstance(event, dict) else {}
             if not isinstance(found.get("event"), str):
-                raise SessionFolderError(self.folder, f"{EVENTS} line {number} is no event")
-            yield upgrade_event(found, self.schema_version)
+                raise SessionFolderError(self.folder, f"{EVENTS} line {line} is no event")
+            yield upgrade_event(found, self.schema_version), byte
 
     def table(self, name: str) -> pd.DataFrame:
         """One of the derived tables (lines, crossings, estimates, track). Raises SessionFolderError when missing."""

@@ -88,6 +88,11 @@ class Antenna(ABC):
         self._connecting = asyncio.Lock()
 
     @property
+    def mtu(self) -> int:
+        """Largest ATT packet that it asks for."""
+        return self.settings.mtu
+
+    @property
     def client_backend(self) -> type[BaseBleakClient]:
         """What bleak's ``BleakClient(backend=...)`` takes."""
         return client_backend(self)

@@ -13,22 +13,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from enum import Enum, auto
-from typing import TYPE_CHECKING
 
-import numpy as np
 from numpy.random import Generator
-from numpy.typing import NDArray
 from shapely.geometry import Polygon
 
 from lab.base.errors import RequestError
-from robot.virtual.physics import BodySettings, Impact
+from robot.virtual.lightsensor import LightAt, LightSensor
+from robot.virtual.physics import BodySettings, Impact, Together
 from robot.virtual.walls import Hit, Walls
 
-if TYPE_CHECKING:
-    from robot.virtual.crowd import Crowd
-
-Floats = NDArray[np.float64]
-LightAt = Callable[[Floats, Floats], Floats]
 TURN = 2.0 * math.pi
 # A drift bends the path; it is followed in chords of at most this time, and of this sagitta near a wall.
 _MAX_STEP_S = 0.1
@@ -82,7 +75,6 @@ class Body:
     ) -> None:
         self.settings = settings if settings is not None else BodySettings()
         self._rng = rng
-        self._light_at = light_at
         self._walls = Walls(reachable)
         self.x_cm, self.y_cm = self._walls.draw(rng) if position_cm is None else position_cm
         if not self._walls.contains(self.x_cm, self.y_cm):
@@ -94,7 +86,7 @@ class Body:
         self.on_bump: Callable[[Impact], None] | None = None
         self.stuck_lux: float | None = None
         self.battery_charge = 1.0
-        self.crowd: Crowd | None = None
+        self.crowd: Together | None = None
         self.beside: tuple[tuple[float, float], ...] = ()
         self._held = False
         self._t_s: float | None = None
@@ -113,7 +105,7 @@ class Body:
         )
         self._locator_x_cm = 0.0
         self._locator_y_cm = 0.0
-        self._footprint_x, self._footprint_y = _footprint(self.settings.footprint_cm)
+        self._light_sensor = LightSensor(light_at, rng, self.settings)
 
     @property
     def t_s(self) -> float:
@@ -217,11 +209,7 @@ class Body:
         """One reading of the light sensor where it stands: footprint mean, own LED and noise, lux (>= 0)."""
         if self.stuck_lux is not None:
             return self.stuck_lux
-        light = self._light_at(self._footprint_x + self.x_cm, self._footprint_y + self.y_cm)
-        mean = float(light.sum()) / light.size
-        settings = self.settings
-        noise = settings.light_noise_lux * self._rng.standard_normal() if settings.light_noise_lux else 0.0
-        return max(0.0, mean + settings.led_leak_lux * self.led_level + noise)
+        return self._light_sensor.read_lux(self.x_cm, self.y_cm, self.led_level)
 
     def advance(self, t_s: float) -> None:
         """Move on to the instant ``t_s``, with its crowd if it has one; an instant already passed changes nothing.
@@ -402,19 +390,3 @@ class Body:
         error_rad = self.settings.bump_angle_rad * float(self._rng.standard_normal())
         normal_heading_rad = (self._frame_rad - normal_rad + error_rad) % TURN
         self.on_bump(Impact(self.t_s, normal_heading_rad, self._heading_rad, speed_cm_s))
-
-
-def _footprint(radius_cm: float) -> tuple[Floats, Floats]:
-    """Thirteen points (13,), (13,) that stand for a disc: the centre and rings of 4 and 8, each for a like area.
-
-    The rings lie at the root mean square radius of the area they stand for, so the second moment of the
-    disc, R²/4 about each axis, is kept within 1 %.
-    """
-    rings = [(1, 0.0), (4, math.sqrt(3 / 13)), (8, math.sqrt(9 / 13))]
-    points = [
-        (radius * math.cos(TURN * (i + 0.5) / count), radius * math.sin(TURN * (i + 0.5) / count))
-        for count, radius in rings
-        for i in range(count)
-    ]
-    array = radius_cm * np.asarray(points, dtype=float)
-    return np.ascontiguousarray(array[:, 0]), np.ascontiguousarray(array[:, 1])

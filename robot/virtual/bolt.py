@@ -16,9 +16,9 @@ from robot.packets import Flag, PacketParser
 from robot.profile import RobotProfile
 from robot.virtual.air import DelayLine
 from robot.virtual.body import Body, BodySettings
-from robot.virtual.faults import Spells
 from robot.virtual.firmware import Firmware, FirmwareSettings
 from robot.virtual.radio import CONNECTION_TIMEOUT, GattCharacteristic, GattService, Peripheral, VirtualRadio
+from robot.virtual.spells import Spells
 
 _BASE = "-574f-4f20-5370-6865726f2121"
 SERVICES = (

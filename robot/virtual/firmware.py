@@ -14,8 +14,8 @@ from robot.commands import COMMANDS, MATRIX_SIDE, BatteryState, ChargerState, Co
 from robot.packets import NOTIFICATION_SEQ, Flag, Packet, encode
 from robot.profile import RobotProfile
 from robot.virtual.body import Body, Impact
+from robot.virtual.channels import channels_of
 
-_M_PER_CM = 0.01
 _NOTIFICATION_FLAGS = int(Flag.ACTIVITY | Flag.HAS_SOURCE)
 _LED_BITS = 0x3F
 _REVERSE = 0x01
@@ -351,38 +351,8 @@ class Firmware:
         self._layout = commands.layout_of(self._primary, self._extended)
         if not self._layout.names:
             self._end_stream()
-        sources = self._channels()
+        sources = channels_of(self.body, self._light_lux)
         self._readers = tuple(sources[name] for name in self._layout.names)
-
-    def _channels(self) -> dict[str, Callable[[], float]]:
-        """Where each streamed value comes from. Yaw is counter-clockwise, as the robot's z axis points up."""
-        body = self.body
-
-        def still() -> float:
-            return 0.0
-
-        def velocity(part: Callable[[float], float]) -> Callable[[], float]:
-            return lambda: _M_PER_CM * body.locator_speed_cm_s * part(body.heading_rad)
-
-        def yaw_deg() -> float:
-            return -math.degrees(math.remainder(body.heading_rad, 2 * math.pi))
-
-        channels = dict.fromkeys((*commands.PRIMARY_CHANNELS, *commands.EXTENDED_CHANNELS), still)
-        channels.update(
-            quaternion_z=lambda: math.sin(math.radians(yaw_deg()) / 2),
-            quaternion_w=lambda: math.cos(math.radians(yaw_deg()) / 2),
-            yaw_deg=yaw_deg,
-            acceleration_z_g=lambda: 1.0,
-            acceleration_g=lambda: 1.0,
-            locator_x_m=lambda: _M_PER_CM * body.locator_cm[0],
-            locator_y_m=lambda: _M_PER_CM * body.locator_cm[1],
-            velocity_x_m_s=velocity(math.sin),
-            velocity_y_m_s=velocity(math.cos),
-            speed_m_s=lambda: _M_PER_CM * body.locator_speed_cm_s,
-            core_time=lambda: body.t_s,
-            ambient_lux=self._light_lux,
-        )
-        return channels
 
     def _collision_setup(self, data: bytes) -> bytes:
         self._collision_method = data[0]

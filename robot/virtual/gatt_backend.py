@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar, Protocol
 from uuid import UUID
 
 from bleak.args import SizedBuffer
@@ -28,25 +28,43 @@ from bumble.device import Advertisement, Connection, Peer
 
 from robot.errors import RadioError
 
-if TYPE_CHECKING:
-    from robot.virtual.antenna import Antenna
-
 _CALL_TIMEOUT_S = 10.0
 _DISCONNECT_TIMEOUT_S = 2.0
 
 
-def client_backend(radio: Antenna) -> type[BaseBleakClient]:
+class Central(Protocol):
+    """What the backends need of the antenna that carries them."""
+
+    @property
+    def mtu(self) -> int:
+        """Largest ATT packet to ask for."""
+        ...
+
+    async def listen(self, ear: Callable[[Advertisement], None]) -> None:
+        """Begin to hand every advertisement to ``ear``."""
+        ...
+
+    async def unlisten(self, ear: Callable[[Advertisement], None]) -> None:
+        """Hand no more advertisements to ``ear``."""
+        ...
+
+    async def connect(self, address: str, timeout_s: float) -> Connection:
+        """Connect to the peripheral at ``address`` once it has been heard. Raises TimeoutError after ``timeout_s``."""
+        ...
+
+
+def client_backend(radio: Central) -> type[BaseBleakClient]:
     """The client backend class that reaches the robots on ``radio``."""
     return type("VirtualClient", (_Client,), {"radio": radio})
 
 
-def scanner_backend(radio: Antenna) -> type[BaseBleakScanner]:
+def scanner_backend(radio: Central) -> type[BaseBleakScanner]:
     """The scanner backend class that hears the robots on ``radio``."""
     return type("VirtualScanner", (_Scanner,), {"radio": radio})
 
 
 class _Scanner(BaseBleakScanner):
-    radio: ClassVar[Antenna]
+    radio: ClassVar[Central]
 
     def __init__(
         self,
@@ -86,7 +104,7 @@ class _Scanner(BaseBleakScanner):
 
 
 class _Client(BaseBleakClient):
-    radio: ClassVar[Antenna]
+    radio: ClassVar[Central]
 
     def __init__(
         self,
@@ -133,7 +151,7 @@ class _Client(BaseBleakClient):
         self.services = await self._bounded(self._discover(self._peer))
 
     async def _discover(self, peer: Peer) -> BleakGATTServiceCollection:
-        await peer.request_mtu(self.radio.settings.mtu)
+        await peer.request_mtu(self.radio.mtu)
         await peer.discover_all()
         collection = BleakGATTServiceCollection()
         for found in peer.services:

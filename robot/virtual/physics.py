@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from typing import Protocol
 
 from lab.base.errors import RequestError
 
@@ -76,3 +77,11 @@ class Impact:
     normal_heading_rad: float
     heading_rad: float
     speed_cm_s: float
+
+
+class Together(Protocol):
+    """What moves a ball on together with others."""
+
+    def advance(self, t_s: float) -> None:
+        """Move all of them on to the instant ``t_s``."""
+        ...

@@ -8,10 +8,10 @@ from scipy import stats
 from shapely import affinity
 from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
 
-from analysis import linekernels, montecarlo
+from analysis import lanes, linekernels, montecarlo
 from analysis.boundary import Boundary
 from analysis.invariants import signed_moment
-from analysis.linekernels import LANES
+from analysis.lanes import LANES
 from analysis.montecarlo import (
     available_cores,
     cross_lines,
@@ -105,10 +105,10 @@ def test_kernels_do_what_their_python_says():
     outline = Boundary.of(random_polygon(1)).outline
     rooms = []
     for of in (lambda function: function, lambda function: function.py_func):
-        state, work = linekernels.seeded(np.random.default_rng(4)), linekernels.work_for(outline)
+        state, work = lanes.seeded(np.random.default_rng(4)), linekernels.work_for(outline)
         with np.errstate(over="ignore"):
-            of(linekernels.draw)(state, work.uniform)
-            of(linekernels.directions)(work.uniform, work.cos, work.sin)
+            of(lanes.draw)(state, work.uniform)
+            of(lanes.directions)(work.uniform, work.cos, work.sin)
             work.p_cm[:] = np.linspace(-20, 20, LANES)
             of(linekernels.sign_words)(outline, work)
         _, crossings = linekernels.list_crossings(outline, work)
@@ -211,7 +211,7 @@ def test_no_crossing_is_dropped_however_many_there_are(rng):
 def test_small_room_changes_nothing(shapes):
     boundary = Boundary.of(shapes["statue"])
     whole = montecarlo._crossings(boundary, 500, np.random.default_rng(1))
-    state, work = linekernels.seeded(np.random.default_rng(1)), linekernels.work_for(boundary.outline)
+    state, work = lanes.seeded(np.random.default_rng(1)), linekernels.work_for(boundary.outline)
     parts, left = [], 500
     while left:
         s_cm, counts = np.empty(LANES * boundary.outline.x_cm.size), np.empty(left, dtype=np.int64)

@@ -11,8 +11,9 @@ from scipy.stats import multivariate_normal
 
 from analysis.figures.paper.explored import Explored, chords_panel, lines_until_calm
 from analysis.figures.paper.known import Known
+from analysis.figures.paper.needed import crowd_panel
 from analysis.figures.paper.panel import PANELS, chosen_panels, write_panel
-from analysis.figures.paper.plane import crowd_panel, domains_panel, window_of
+from analysis.figures.paper.plane import domains_panel, window_of
 from analysis.landscape import domains, lines_to_be_sure, lines_to_confidence
 from analysis.quadrature import exact_moments
 from analysis.scaling import fit_scatter

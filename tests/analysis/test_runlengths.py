@@ -156,6 +156,16 @@ def test_a_wrong_scale_is_no_wrong_turn(tables):
     assert seen.mean_p < 0.05
 
 
+@pytest.mark.parametrize("scale", [0.99, 1.0, 1.01])
+def test_a_scale_that_is_off_a_little_is_no_wrong_turn(scale, tables):
+    """Runs straight across pile up at the height of a rectangle: all of them move together, and mean nothing."""
+    rng = np.random.default_rng(14)
+    sessions = [scale * own_billiard(lambert, 150, seed) for seed in range(100, 160)]
+    seen = [examine_runs(lengths, RECTANGLE, rng, table=tables["rectangle"]) for lengths in sessions]
+    assert 0.7 < np.median([one.exponent for one in seen]) < 1.4
+    assert np.mean([one.passed for one in seen]) > 0.85
+
+
 def test_interior_stops():
     rng = np.random.default_rng(8)
     table = tabulate_runs(RECTANGLE, 200, rng, length_weighted=True, sessions=499)
@@ -182,14 +192,18 @@ def test_requests_that_cannot_be_examined(tables):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "power"), [("rectangle", 0.75), ("disc", 0.99)])
+@pytest.mark.parametrize(("name", "power"), [("rectangle", 0.7), ("disc", 0.99)])
 def test_false_alarms_and_power_at_150_runs(name, power, tables):
-    """2000 right sessions: 5 ± 1.5 % are suspected, 95 ± 1.5 % of the intervals hold 1. 300 uniform ones are caught."""
+    """2000 right sessions: 5 ± 1.5 % are suspected, 95 ± 1.5 % of the intervals hold 1. 300 uniform ones are caught.
+
+    Their lengths are off by 1 % from session to session, as the table supposes.
+    """
     rng = np.random.default_rng(10)
     table = tabulate_runs(ARENAS[name], 150, rng)
 
     def seen(exponent, sessions):
         rows = roll(ARENAS[name], sessions, 150, rng, exponent=exponent).length_cm
+        rows *= rng.normal(1.0, 0.01, (sessions, 1))
         return [examine_runs(row, ARENAS[name], rng, table=table) for row in rows]
 
     right = seen(1.0, 2000)

@@ -14,7 +14,8 @@ from shapely.geometry import Point, Polygon
 
 from analysis.boundary import Boundary
 from analysis.kernels import available_cores, kernel
-from analysis.linekernels import LANES, draw, seeded, sign_words, throw, work_for
+from analysis.lanes import LANES, draw, seeded
+from analysis.linekernels import sign_words, throw, work_for
 from analysis.montecarlo import simulate
 from analysis.quadrature import exact_moments
 from projector.dictionary import load_dictionary

@@ -30,7 +30,7 @@ NOT_RUN = {
     "it takes minutes; its parts are tested beside the code": {
         "README.md": [
             "run --simulate --shape eiffel", "run --simulate --shape windmill", "figures --out figures",
-            "run --robot virtual --robot virtual --robot virtual",
+            "run --robot virtual --robot virtual --robot virtual", "validate data/sessions/square-filmed",
         ],
         "docs/calibration.md": ["calibrate camera truth.toml"],
         "docs/figures.md": ["figures"],
@@ -46,6 +46,9 @@ NOT_RUN = {
             "run --simulate --shape windmill",
             "shapes separability --collection letters", "shapes separability my_tower",
         ],
+    },
+    "it is paced to be followed, or serves until Ctrl-C; tests/lab opens it in a browser": {
+        "docs/howto/live-page.md": ["run --simulate --no-video --shape square --lines 150", "watch"],
     },
     "it wants a cluster: see docs/howto/cluster.md, which is run with one": {"docs/batch.md": ["batch /shared"]},
 }  # fmt: skip

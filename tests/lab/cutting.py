@@ -12,30 +12,16 @@ from pathlib import Path
 from lab.reopen.resume import pick_up, resume
 from lab.session.experiment import Finished
 from robot.onboard import Estimator
+from tests.lab.eventlog import EventLog
 
 RESUMED = datetime(2026, 11, 24, 9, 0)
 
 
 @dataclass(frozen=True)
-class Log:
+class Log(EventLog):
     """The events of a session, as they stand."""
 
     folder: Path
-
-    @property
-    def events(self) -> list[dict]:
-        return [json.loads(line) for line in (self.folder / "events.jsonl").read_text().splitlines()]
-
-    def told(self, kind: str) -> list[dict]:
-        return [event for event in self.events if event["event"] == kind]
-
-    @property
-    def runs(self) -> list[dict]:
-        return self.told("line")
-
-    @property
-    def manifest(self) -> dict:
-        return json.loads((self.folder / "manifest.json").read_text())
 
 
 def cut_after(folder: Path, runs: int, copy: Path) -> Path:

@@ -1,6 +1,7 @@
 """The commands as a user meets them: exit codes, one-line errors, JSON alone on stdout."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pandas as pd
 import pytest
 
 from lab.cli.main import main
+from lab.cli.output import show_table
 from lab.store.reader import SessionReader
 
 
@@ -50,6 +52,12 @@ def test_every_command_has_help_with_an_example(say, words):
     assert code == 0
     assert f"Example: chordlab {' '.join(words)}" in out
     assert "--json" in out
+    assert ("--quiet" in out) == (" ".join(words) not in NOTHING_BUT_RESULTS)
+
+
+NOTHING_BUT_RESULTS = {  # no progress, no remarks, and no table beside a file
+    "watch", "moments", "project", "shapes list", "robot scan", "robot info", "robot drive", "robot virtual",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -118,6 +126,23 @@ def test_shapes_are_listed_and_drawn(say, tmp_path):
     assert str(picture) in out.replace("\n", "")
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert as_json(say("shapes", "show", "text:HI", "--out", tmp_path / "hi.svg", "--json")[1])["pieces"] == 2
+
+
+@pytest.mark.parametrize("columns", [40, 60, 80, 140])
+def test_no_figure_of_a_table_is_cut_however_narrow_it_is(capsys, monkeypatch, columns):
+    """Texts fold between words; where there is no room for that, a row is a line."""
+    monkeypatch.setenv("COLUMNS", str(columns))
+    figures = ["1 234.5 ± 12.3", "10 min (12 min)", "−0.07 ± 0.08"]
+    show_table("Budget", ("term", "A, cm²", "time", "P, %", "what it is"), [
+        ("speed scale", *figures, "how far the robot rolls in a second"),
+        ("latency", *figures, "what the Bluetooth link adds"),
+    ])  # fmt: skip
+    out = capsys.readouterr().out
+    assert max(map(len, out.splitlines())) <= columns
+    for figure in figures:
+        assert out.count(figure) == 2
+    told = set(re.findall(r"\w+", out))
+    assert {"speed", "scale", "robot", "rolls", "Bluetooth", "latency"} <= told
 
 
 def test_tables_for_people_come_out_whole(say, square_session):

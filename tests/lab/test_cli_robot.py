@@ -33,7 +33,7 @@ def complaint(capsys, code: int, *argv: str) -> str:
     assert out == ""
     assert err.endswith("\n")
     assert err.count("\n") == 1
-    assert err.startswith("chordlab: ")
+    assert err.startswith("error: ")
     return err
 
 
@@ -83,7 +83,7 @@ def test_without_bluetooth_it_says_so_in_one_line(capsys, monkeypatch) -> None:
     async def no_radio(timeout_s: float, scanner_backend: object = None) -> list[object]:
         raise BluetoothUnavailableError("robots", "its Bluetooth service is not running")
 
-    monkeypatch.setattr("lab.cli.robot.scan", no_radio)
+    monkeypatch.setattr("robot.bolt.scan", no_radio)
     assert "no Bluetooth on this machine" in complaint(capsys, 1, "robot", "scan", "--seconds", "0.5")
 
 

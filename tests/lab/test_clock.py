@@ -44,6 +44,21 @@ def test_timeouts_hold_at_virtual_time():
     assert run(main(), virtual=True) == pytest.approx(7.0)
 
 
+@pytest.mark.parametrize("start_s", [1e7, 3.3e7, 1e9])
+def test_timers_fire_after_months_of_virtual_time(start_s):
+    seen: list[float] = []
+
+    async def main():
+        loop = asyncio.get_running_loop()
+        for delay_s in (0.1, 0.3, 0.7):
+            loop.call_later(delay_s, seen.append, delay_s)
+        await asyncio.sleep(1)
+        return loop.time()
+
+    assert run(main(), virtual=True, not_before_s=start_s) == pytest.approx(start_s + 1, rel=1e-15)
+    assert seen == [0.1, 0.3, 0.7]
+
+
 def test_a_thread_can_wake_a_loop_that_has_no_timer():
     async def main():
         done = asyncio.Event()

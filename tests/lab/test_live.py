@@ -1,6 +1,7 @@
 """The session's side of the live page: controls, the clock's pace, the lossy feed. All without a page."""
 
 import asyncio
+import contextlib
 import json
 import math
 import selectors
@@ -36,7 +37,8 @@ def events_of(finished):
 
 def test_a_watched_session_is_byte_for_byte_the_unwatched_one(tmp_path):
     here, there = make_channel()
-    watched = roll_live(tmp_path / "a", Live(here))
+    live = Live(here)
+    watched = roll_live(tmp_path / "a", live, press=lambda live, step: live.feed.look())
     alone = roll_live(tmp_path / "b", None, press=lambda live, step: None)
     logs = [(finished.folder / "events.jsonl").read_bytes() for finished in (watched, alone)]
     assert logs[0] == logs[1]
@@ -198,6 +200,7 @@ def test_the_feed_speaks_a_few_times_a_second_and_pictures_are_small():
     feed = Feed(here, now=lambda: now_s[0])
     for step in range(1000):  # ten seconds at 100 samples/s
         now_s[0] = step / 100
+        feed.look()
         feed.sample("r", Sample(now_s[0], 20.0, 0, 0, 0), lit=False, line=1, battery_v=3.9)
     there.news.setblocking(False)
     heads = []
@@ -207,9 +210,10 @@ def test_the_feed_speaks_a_few_times_a_second_and_pictures_are_small():
         except BlockingIOError:
             break
     assert 40 <= len(heads) <= 60
-    assert sum(len(head["light"]) for head in heads) >= 950
+    assert sum(len(head["light"].get("r", [])) for head in heads) >= 950
     picture = np.full((720 * 3 // 2, 1280), 128, dtype=np.uint8)
     picture[:720] = np.random.default_rng(1).integers(0, 255, (720, 1280))
+    feed.look()
     for index in range(3):
         feed.frame(Frame(index, 0.0, 0.0, picture))
     head, jpeg = read_news(there.news.recv(1 << 16))
@@ -217,6 +221,35 @@ def test_the_feed_speaks_a_few_times_a_second_and_pictures_are_small():
     assert jpeg.startswith(b"\xff\xd8")
     with pytest.raises(BlockingIOError):
         there.news.recv(1 << 16)
+    here.close()
+    there.close()
+
+
+def test_while_nobody_looks_nothing_is_made():
+    here, there = make_channel()
+    there.news.setblocking(False)
+    now_s = [0.0]
+    feed = Feed(here, now=lambda: now_s[0])
+    picture = Frame(0, 0.0, 0.0, np.zeros((72 * 3 // 2, 128), dtype=np.uint8))
+
+    def told():
+        feed.sample("r", Sample(now_s[0], 20.0, 0, 0, 0), lit=False, line=1, battery_v=3.9)
+        feed.frame(picture)
+        kinds = []
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                kinds.append(read_news(there.news.recv(1 << 16))[0]["kind"])
+        return kinds
+
+    assert told() == []
+    feed.look()
+    assert told() == ["news", "picture"]
+    now_s[0] += 1
+    assert told() == ["news", "picture"]
+    now_s[0] += 60  # the page was closed, or its server hangs
+    assert told() == []
+    feed.tell(said="on")  # what is kept is told whoever looks: it is little, and never said again
+    assert told() == ["news"]
     here.close()
     there.close()
 

@@ -1,6 +1,8 @@
 """What is shown of a session at any time, against its tables and against closed forms."""
 
+import json
 import math
+import shutil
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from hypothesis import strategies as st
 
 from lab.live.folder import StoryFolder
 from lab.live.story import Story, lit_stretches
+from lab.store.layout import SessionFolderError
 from lab.store.reader import SessionReader
 from lab.store.tables import tables_of
 
@@ -144,25 +147,22 @@ def test_a_stored_frame_is_that_of_its_time_and_shows_the_led(alone_on_film):
         assert abs(int(np.argmin(off)) - row) <= 1
 
 
-def test_the_eye_finds_the_led_in_small_pictures(alone_on_film):
+def test_the_led_is_found_in_the_small_pictures_of_a_running_session(alone_on_film):
     """Truth: the track of the whole film."""
     from lab.live.channel import make_channel, read_news
     from lab.live.feed import Feed
-    from lab.live.page.pictures import Eye
-    from tracking.calibration import Calibration
+    from lab.live.page.pictures import Newest
     from tracking.cameras import Frame, pack_i420
-    from tracking.track import track_segments
     from tracking.video import read_frames
 
     folder = StoryFolder(alone_on_film)
     folder.read()
-    calibration = Calibration.from_dict(folder.session.manifest["calibration"]["camera"])
-    track = track_segments(folder.session.segments(), calibration, workers=1)
+    track = tracked(folder)
     here, there = make_channel()
     there.news.settimeout(5)
     now_s = [0.0]
-    feed, eye = Feed(here, now=lambda: now_s[0]), Eye(folder)
-    errors, missed = [], 0
+    feed, newest = Feed(here, now=lambda: now_s[0]), Newest(folder)
+    errors, states, missed = [], [], 0
     for line, path in list(folder.session.segments().items())[:8]:
         rows = track[track["line"] == line].set_index("frame")
         with read_frames(path, threads=1, quiet=True) as reader:
@@ -170,14 +170,92 @@ def test_the_eye_finds_the_led_in_small_pictures(alone_on_film):
                 if frame.index % 2:
                     continue
                 now_s[0] += 1
+                feed.look()
                 feed.frame(Frame(frame.index, 0.0, 0.0, pack_i420(frame.luma, frame.chroma())))
-                _, place = eye.look(read_news(there.news.recv(1 << 16))[1], lit=False)
-                x_cm, y_cm = rows.loc[frame.index, ["x_cm", "y_cm"]]
-                if place is None or not math.isfinite(x_cm):
+                _, places = newest.mark(read_news(there.news.recv(1 << 16))[1], lit=False)
+                x_cm, y_cm, lit = rows.loc[frame.index, ["x_cm", "y_cm", "led_on"]]
+                if not places or not math.isfinite(x_cm):
                     missed += 1
                 else:
-                    errors.append(math.dist(place, (x_cm, y_cm)))
+                    errors.append(math.dist(places[0][:2], (x_cm, y_cm)))
+                    states.append(places[0][2] == lit)
     here.close()
     there.close()
     assert len(errors) > 3 * missed  # the first pictures only show what the floor is
     assert np.percentile(errors, 95) < 3
+    assert np.mean(states) > 0.9
+
+
+@pytest.mark.parametrize("film", ["alone_on_film", "pair_on_film"])
+def test_the_trail_is_that_of_the_track(film, request):
+    """Truth: the track of the whole film, of which it sees every few centimetres of every robot."""
+    from lab.live.page.trail import Trail
+
+    folder = StoryFolder(request.getfixturevalue(film))
+    folder.read()
+    robots = len(folder.settings.robots)
+    trail = Trail(folder)
+    while trail.read_next():
+        pass
+    seen, track = trail.sightings(), tracked(folder)
+    frames_s = np.concatenate([np.asarray(times_of(folder, line)) for line in folder.session.segments()])
+    assert len(seen.t_s) > 0.8 * robots * np.ptp(frames_s) / 0.25
+    assert (np.diff(seen.t_s) >= 0).all()
+    hits = [0, 0]
+    track = track.dropna(subset=["x_cm"])
+    for t_s, x_cm, y_cm, lit in zip(seen.t_s, seen.x_cm, seen.y_cm, seen.lit, strict=True):
+        now = track[np.abs(track["t_host_s"] - t_s) < 1e-6]
+        off_cm = np.hypot(now["x_cm"] - x_cm, now["y_cm"] - y_cm).to_numpy()
+        if len(off_cm):
+            hits[0] += off_cm.min() < 3
+            hits[1] += now["led_on"].iloc[int(off_cm.argmin())] == lit
+    assert hits[0] > 0.95 * len(seen.t_s)
+    assert hits[1] > 0.9 * len(seen.t_s)
+
+
+def times_of(folder, line):
+    import pandas as pd
+
+    return pd.read_parquet(folder.session.line_path(line, "video.frames.parquet"))["t_host_s"].to_numpy()
+
+
+def tracked(folder):
+    """The whole film's track, with each frame's time on the session's clock."""
+    from tracking.track import track_segments
+
+    calibration = folder.settings.camera_calibration()
+    segments = folder.session.segments()
+    track = track_segments(segments, calibration, workers=1, robots=len(folder.settings.robots))
+    times = {line: times_of(folder, line) for line in segments}
+    track["t_host_s"] = [times[line][frame] for line, frame in zip(track["line"], track["frame"], strict=True)]
+    return track
+
+
+def test_of_a_growing_log_only_what_is_new_is_read(square_session, tmp_path, monkeypatch):
+    """Byte by byte about the ends of records, as a writer that is cut off leaves it; truth: the whole log."""
+    shutil.copytree(square_session.folder, copy := tmp_path / "copy")
+    log = copy / "events.jsonl"
+    whole = log.read_bytes()
+    ends = [place + 1 for place, byte in enumerate(whole) if byte == 10]
+    log.write_bytes(whole[: ends[9]])
+    folder = StoryFolder(copy)
+    assert folder.read()
+    parsed = []
+    monkeypatch.setattr("lab.store.reader.json_of", lambda record: parsed.append(record) or json.loads(record))
+    assert not folder.read()
+    for cut, events in ((ends[10] - 1, 10), (ends[10], 11), (ends[11] + 5, 12), (ends[40] - 40, 40), (ends[40], 41)):
+        before = folder.story.events
+        log.write_bytes(whole[:cut])
+        assert folder.read() == (events > before)
+        assert folder.story.events == events
+    log.write_bytes(whole)
+    folder.read()
+    assert parsed == whole.splitlines()[10:]  # each once
+    afresh = StoryFolder(copy)
+    afresh.read()
+    assert folder.story.at(math.inf) == afresh.story.at(math.inf)
+    log.write_bytes(whole + b'{"event": "note", "t_s"')
+    assert not folder.read()
+    log.write_bytes(whole + b"no json\n")
+    with pytest.raises(SessionFolderError, match=f"line {len(ends) + 1} is no JSON"):
+        folder.read()

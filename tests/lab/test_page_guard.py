@@ -154,7 +154,8 @@ def test_charts_of_nothing_and_of_little_are_drawn(square_session):
                 charts.plane(moment.standings, truth, ink),
                 charts.names(moment.last, ink),
                 charts.runs(moment.runs, ink),
-                charts.light_strip([], ink),
+                charts.light_strip({}, ink),
+                charts.light_strip({"a": [(1.0, 20.0), (1.05, 119.5)], "b": []}, ink),
             ]
             assert all(len(options["series"]) == len(options["series"]) for options in drawn)
             numbers = [point for options in drawn for series in options["series"] for point in series["data"]]
@@ -185,6 +186,18 @@ def test_the_map_draws_what_was_seen():
     assert 'class="way" d="M0.0 -5.0h0"' in drawing
     assert 'class="lit" d="M1.0 -6.0h0M2.0 -7.0h0"' in drawing
     assert 'viewBox="-62 -47 124 94"' in drawing
+    assert drawing.count("<circle") == 1
+    pair = Sightings(np.array([0.0, 1, 1]), np.zeros(3), np.array([5.0, 6, 7]), np.array([False, True, False]))
+    here = arena_svg(box(-60, -45, 60, 45), [], pair, label="x")
+    assert [here.count(f'class="here {state}"') for state in ("lit", "dark")] == [1, 1]  # both robots
+
+
+def test_each_robot_has_a_line_of_its_own_light():
+    strip = charts.light_strip({name: [(1.0, 20.0), (2.0, 120.0)] for name in "abc"}, charts.LIGHT)
+    assert [series["name"] for series in strip["series"]] == ["a", "b", "c"]
+    assert [series["data"] for series in strip["series"]] == [[[-1.0, 20.0], [0.0, 120.0]]] * 3
+    assert len({(s["lineStyle"]["type"], s["lineStyle"]["color"]) for s in strip["series"]}) == 3
+    assert strip["legend"]["show"]
 
 
 def test_words():

@@ -162,8 +162,6 @@ def test_the_command_goes_on_reports_and_seals(short, tmp_path, capsys):
 
 
 def test_an_interrupt_names_the_command_that_goes_on(tmp_path, capfd, monkeypatch):
-    from lab.cli import run as command
-
     def interrupted(settings, *, watch, **more):
         def stop(step):
             if step.n == 3:
@@ -171,7 +169,7 @@ def test_an_interrupt_names_the_command_that_goes_on(tmp_path, capfd, monkeypatc
 
         return run_experiment(settings, watch=stop, **more)
 
-    monkeypatch.setattr(command, "run_experiment", interrupted)
+    monkeypatch.setattr("lab.session.experiment.run_experiment", interrupted)
     arguments = ["--simulate", "--shape", "square", "--no-video", "--lines", "6", "--out", str(tmp_path)]
     assert main(["run", *arguments, "--quiet"]) == 1
     (folder,) = tmp_path.iterdir()

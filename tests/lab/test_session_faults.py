@@ -166,7 +166,7 @@ def test_the_command_says_it_in_one_line_exits_1_and_still_reports(tmp_path, cap
     )
     assert main(["run", str(file), "--out", str(tmp_path / "out"), "--quiet"]) == 1
     out, err = capsys.readouterr()
-    assert err.startswith("chordlab: SB-7E57: the link was lost")
+    assert err.startswith("error: SB-7E57: the link was lost")
     assert err.count("\n") == 1
     (report,) = out.splitlines()
     (folder,) = (tmp_path / "out").iterdir()

@@ -105,7 +105,7 @@ def test_import_says_what_it_did(say, tmp_path):
         (["import", "text:"], "text is empty"),
         (["import", "text:AB"], "--name"),
         (["separability", "eiffel"], "at least two"),
-        (["separability", "eiffel", "square", "--confidence", "2"], "between 0.5 and 1"),
+        (["separability", "eiffel", "square", "--confidence", "2"], "--confidence"),
         (["separability", "--lines", "0"], "--lines"),
         (["separability", "--out", "plot.txt"], "a picture ends in"),
     ],

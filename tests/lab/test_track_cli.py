@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 import shapely
 
-from lab.cli import track as command
+from lab import filmtrack
 from lab.cli.main import main
 from tracking.calibration import save_calibration
 from tracking.film import FilmFaults, blink_in, default_optics, light_of, make_film, rolling
@@ -114,7 +114,7 @@ def test_a_file_cut_short_is_tracked_to_its_end_and_said_to_be(films, tmp_path, 
 def test_what_cannot_be_tracked_is_told_in_one_line(films, tmp_path, capsys, name, says):
     code, said, told = call(capsys, films[0] / name, "--out", tmp_path / "t.parquet")
     assert code == 2 and not said
-    assert told.count("\n") == 1 and told.startswith("chordlab: ") and says in told
+    assert told.count("\n") == 1 and told.startswith("error: ") and says in told
     assert not list(tmp_path.iterdir())
 
 
@@ -143,8 +143,8 @@ def test_an_interrupted_preview_leaves_no_half_file(films, tmp_path, capsys, mon
 
         return whole(videos, table, out, stop)
 
-    whole = command.preview_films
-    monkeypatch.setattr(command, "preview_films", interrupted)
+    whole = filmtrack.preview_films
+    monkeypatch.setattr(filmtrack, "preview_films", interrupted)
     code, _, _ = call(capsys, one.path, "--out", tmp_path / "t.csv", "--preview", tmp_path / "p.mkv")
     assert code == 1
     assert [file.name for file in tmp_path.iterdir()] == ["t.csv"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -18,10 +17,11 @@ from lab.session.experiment import Finished, run_experiment
 from lab.settings.load import load_settings
 from robot.virtual.body import Body
 from tests.lab.conftest import STARTED
+from tests.lab.eventlog import EventLog
 
 
 @dataclass
-class Watched:
+class Watched(EventLog):
     """A session, the bodies that rolled in it, and what was said."""
 
     finished: Finished
@@ -31,17 +31,6 @@ class Watched:
     @property
     def folder(self) -> Path:
         return self.finished.folder
-
-    @property
-    def events(self) -> list[dict]:
-        return [json.loads(line) for line in (self.folder / "events.jsonl").read_text().splitlines()]
-
-    def told(self, kind: str) -> list[dict]:
-        return [event for event in self.events if event["event"] == kind]
-
-    @property
-    def runs(self) -> list[dict]:
-        return self.told("line")
 
     def light(self, line: int) -> pd.DataFrame:
         return pd.read_parquet(self.folder / f"lines/{line:06d}/light.parquet")

@@ -14,8 +14,9 @@ from lab.base.pinhole import Pinhole
 from lab.clock import run
 from projector import images as projector_images
 from projector import window as projector_window
-from projector.device import ProjectorDevice, ProjectorError, ProjectorRequestError, now_s, open_projector
+from projector.device import ProjectorDevice, ProjectorError, ProjectorRequestError, now_s
 from projector.images import ImageFolder
+from projector.opening import open_projector
 from projector.virtual import VirtualProjector
 
 
@@ -276,9 +277,9 @@ def test_without_pygame_the_cure_is_told(monkeypatch):
 def test_pygame_is_imported_only_for_a_window_and_greets_nobody():
     code = (
         "import sys, os; os.environ['SDL_VIDEODRIVER'] = 'dummy'\n"
-        "import projector.device, projector.dictionary, projector.virtual, projector.draw\n"
+        "import projector.device, projector.opening, projector.dictionary, projector.virtual, projector.draw\n"
         "assert 'pygame' not in sys.modules\n"
-        "projector.device.open_projector('display:0').close()\n"
+        "projector.opening.open_projector('display:0').close()\n"
         "assert 'pygame' in sys.modules\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)

@@ -27,7 +27,7 @@ HAND = """
 import json, sys
 import numpy as np
 from lab.base.errors import ChordlabError
-from projector.device import open_projector
+from projector.opening import open_projector
 projector = None
 for line in sys.stdin:
     command = json.loads(line)

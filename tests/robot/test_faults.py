@@ -18,8 +18,9 @@ from robot.errors import RadioError, RobotError
 from robot.profile import RobotProfile
 from robot.virtual.body import Body
 from robot.virtual.bolt import VirtualBolt
-from robot.virtual.faults import KINDS, Fault, Spells, schedule
+from robot.virtual.faults import KINDS, Fault, schedule
 from robot.virtual.radio import AirSettings, VirtualRadio
+from robot.virtual.spells import Spells
 
 # Patient with a silent stream, so that a test can look at the silence.
 PATIENT = RobotProfile(silence_s=1000.0, keep_alive_s=1000.0, reply_timeout_s=2.0)

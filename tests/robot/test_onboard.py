@@ -1,67 +1,15 @@
 """The on-board estimator against exact pair sums, closed forms and NumPy's covariance."""
 
-import ast
 import math
-from fractions import Fraction
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import robot.onboard
 from robot.onboard import Estimator
-
-
-def signed_pair_sum(s_cm, n):
-    """Eq. 1's L_n over all pairs of crossings, O(k^2), exact in rational numbers."""
-    total = Fraction(0)
-    for (i, a), (j, b) in combinations(enumerate(s_cm), 2):
-        total += (1 if (i + j) % 2 else -1) * abs(Fraction(b) - Fraction(a)) ** n
-    return total
-
-
-def roll(estimator, s_cm, weight=1.0):
-    estimator.start_line()
-    for order, s in enumerate(s_cm):
-        estimator.crossing(s, order % 2 == 0)
-    return estimator.end_line(None, weight)
-
-
-def rolled(lines, **kept):
-    estimator = Estimator(**kept)
-    for s_cm in lines:
-        roll(estimator, s_cm)
-    return estimator
-
-
-def disc_lines(n, radius, rng):
-    half = np.sqrt(radius**2 - rng.uniform(-radius, radius, n) ** 2)
-    return np.column_stack([-half, half]).tolist()
-
-
-def annulus_lines(n, outer, inner, rng):
-    p = rng.uniform(-outer, outer, n)
-    half = np.sqrt(outer**2 - p**2)
-    hole = np.sqrt(np.maximum(inner**2 - p**2, 0.0))
-    return [[-h, -g, g, h] if g > 0 else [-h, h] for h, g in zip(half.tolist(), hole.tolist(), strict=True)]
-
-
-def square_lines(n, side, rng):
-    """Uniform lines that meet a square, by clipping those that meet its circumscribed circle."""
-    half, lines = side / 2, []
-    while len(lines) < n:
-        theta, p = rng.uniform(0, math.pi), rng.uniform(-half * math.sqrt(2), half * math.sqrt(2))
-        x, y, dx, dy = p * math.cos(theta), p * math.sin(theta), -math.sin(theta), math.cos(theta)
-        slab_x = sorted(((-half - x) / dx, (half - x) / dx))
-        slab_y = sorted(((-half - y) / dy, (half - y) / dy))
-        entry, leave = max(slab_x[0], slab_y[0]), min(slab_x[1], slab_y[1])
-        if entry < leave:
-            lines.append([entry, leave])
-    return lines
-
+from tests.robot.drawnlines import annulus_lines, disc_lines, roll, rolled, signed_pair_sum, square_lines
 
 steps = st.floats(min_value=1e-3, max_value=80.0)
 
@@ -76,13 +24,6 @@ def test_recursion_equals_the_sum_over_all_pairs(widths):
     sums = [float(signed_pair_sum(s_cm, n)) for n in (1, 3, 4, 5)]
     assert [l1, l3, *higher.higher_of_line()] == pytest.approx(sums, rel=1e-12)
     assert all(math.isnan(value) for value in plain.higher_of_line())
-
-
-def test_lines_are_forgotten_between_lines():
-    estimator = Estimator()
-    first = roll(estimator, [1.0, 4.0, 9.0, 11.0])
-    roll(estimator, [0.5, 30.0])
-    assert roll(estimator, [1.0, 4.0, 9.0, 11.0]) == first
 
 
 def distances(lines):
@@ -329,121 +270,3 @@ def test_merging_with_a_session_without_covariance_leaves_none():
     first.merge(second)
     assert first.means()[1] == pytest.approx(4.0)
     assert math.isnan(first.sigma_area())
-
-
-def test_runs_that_miss_the_shape_do_not_count_as_lines():
-    estimator = Estimator()
-    assert roll(estimator, []) == (0, 0.0, 0.0)
-    assert math.isnan(estimator.area())
-    assert math.isnan(estimator.means()[0])
-    roll(estimator, [1.0, 4.0])
-    area = estimator.area()
-    roll(estimator, [])
-    assert (estimator.runs, estimator.lines, estimator.chords) == (3, 1, 1)
-    assert estimator.area() == area == pytest.approx(math.pi / 3 * 9)
-    assert estimator.perimeter() == pytest.approx(math.pi * area / 3)
-
-
-def test_a_dropped_line_has_never_been():
-    rng = np.random.default_rng(10)
-    kept, dropped = Estimator(), Estimator()
-    for line in annulus_lines(20, 12.0, 6.0, rng):
-        roll(kept, line)
-        dropped.start_line()
-        for order, s_cm in enumerate(line[: rng.integers(1, len(line) + 1)]):
-            dropped.crossing(s_cm, order % 2 == 0)
-        dropped.drop_line()
-        roll(dropped, line)
-    assert dropped.covariance() == kept.covariance()
-    assert (dropped.runs, dropped.lines, dropped.chords) == (kept.runs, kept.lines, kept.chords)
-    kept.drop_line()  # none in progress: harmless
-    assert dropped.area() == kept.area()
-
-
-def test_a_line_that_ends_lit_is_closed_at_its_end():
-    estimator = Estimator()
-    estimator.start_line()
-    estimator.crossing(2.0, True)
-    with pytest.raises(ValueError, match="ended in the light"):
-        estimator.end_line()
-    assert estimator.runs == 0
-    assert estimator.end_line(7.0) == (1, 5.0, 125.0)
-    estimator.start_line()
-    estimator.crossing(2.0, True)
-    estimator.crossing(7.0, False)
-    assert estimator.end_line(9.0) == (1, 5.0, 125.0)  # in the dark, the end adds nothing
-
-
-def test_refused_calls_leave_the_line_as_it_was():
-    estimator = Estimator()
-    for call in (lambda: estimator.crossing(1.0, True), estimator.end_line):
-        with pytest.raises(ValueError, match="no line is in progress"):
-            call()
-    estimator.start_line()
-    with pytest.raises(ValueError, match="in progress"):
-        estimator.start_line()
-    with pytest.raises(ValueError, match="alternate"):
-        estimator.crossing(1.0, False)
-    with pytest.raises(ValueError, match="nowhere"):
-        estimator.crossing(math.nan, True)
-    estimator.crossing(1.0, True)
-    with pytest.raises(ValueError, match="alternate"):
-        estimator.crossing(2.0, True)
-    with pytest.raises(ValueError, match="behind"):
-        estimator.crossing(0.5, False)
-    estimator.crossing(3.0, False)
-    with pytest.raises(ValueError, match="behind"):
-        estimator.crossing(2.5, True)
-    assert estimator.end_line() == (1, 2.0, 8.0)
-
-
-def test_sigmas_where_they_are_not_known():
-    single = rolled([[0.0, 3.0]])
-    assert all(math.isnan(value) for value in (single.sigma_area(), single.sigma_perimeter(), single.correlation()))
-    alike = rolled([[0.0, 3.0]] * 5)
-    assert alike.sigma_area() == pytest.approx(0.0, abs=1e-9)
-    assert math.isnan(alike.correlation())
-    without = rolled([[0.0, 3.0], [0.0, 4.0]], covariance=False)
-    assert math.isnan(without.sigma_perimeter())
-    assert without.area() == pytest.approx(math.pi / 3 * 91 / 7)
-    nothing = rolled([[1.0, 1.0]])  # a chord of no length
-    assert math.isnan(nothing.area() + nothing.perimeter())
-
-
-def test_memory_is_constant():
-    """No attribute beyond the slots, and none of them grows with the session."""
-
-    def size(estimator):
-        values = [getattr(estimator, slot) for slot in Estimator.__slots__]
-        return sum(len(value) if hasattr(value, "__len__") else 1 for value in values)
-
-    estimator = Estimator()
-    before = size(estimator)
-    for line in annulus_lines(500, 12.0, 6.0, np.random.default_rng(11)):
-        roll(estimator, line)
-    assert not hasattr(estimator, "__dict__")
-    assert size(estimator) == before == 24
-
-
-def test_module_keeps_to_micropython():
-    """Imports, syntax and ``math`` names that every MicroPython build has; none of its gaps."""
-    tree = ast.parse(Path(robot.onboard.__file__).read_text(encoding="utf-8"))
-    imported = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            imported |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            imported.add(node.module)
-    assert imported == {"math", "array"}
-    unsupported = (ast.Match, ast.TryStar, ast.JoinedStr, ast.AsyncFunctionDef, ast.Starred, ast.NamedExpr)
-    assert [type(node).__name__ for node in ast.walk(tree) if isinstance(node, unsupported)] == []
-    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
-    assert all(not function.args.posonlyargs and not function.decorator_list for function in functions)
-    classes = [node for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
-    assert all(len(cls.bases) < 2 and not cls.keywords and not cls.decorator_list for cls in classes)
-    math_names = {
-        node.attr
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "math"
-    }
-    assert math_names <= {"pi", "sqrt", "isfinite"}

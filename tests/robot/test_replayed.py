@@ -9,8 +9,8 @@ import pytest
 from lab.base.timeline import Timeline
 from lab.clock import run
 from robot.device import Identity, RobotDevice
-from robot.edge import KnowsEdge
 from robot.errors import NotConnectedError, ReconnectError
+from robot.feeledge import KnowsEdge
 from robot.replayed import ReplayedRobot, RunsUsedUpError, StoredRun
 
 WHO = Identity("SB-0001", "00:00", "6.0.46", 4.1)

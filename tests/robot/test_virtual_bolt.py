@@ -1,23 +1,22 @@
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import struct
 
 import numpy as np
 import pytest
-from bleak import BleakClient, BleakScanner
+from bleak import BleakScanner
 from shapely.geometry import box
 
 from lab.base.errors import RequestError
 from lab.clock import run
 from robot import commands
-from robot.commands import COMMANDS, Collision, Request
-from robot.link import ANTI_DOS_UUID, ANTI_DOS_WORDS, COMMANDS_UUID
-from robot.packets import Packet, PacketParser, encode
+from robot.commands import COMMANDS, Request
+from robot.link import COMMANDS_UUID
+from robot.packets import Packet, encode
 from robot.virtual.body import Body
 from robot.virtual.bolt import BoltSettings, VirtualBolt
 from robot.virtual.radio import AirSettings
+from tests.robot.plainclient import Client, session
 
 # The protocol's table: device, command, target (0: none), a good payload, bytes of the answer's payload.
 TABLE = {
@@ -49,54 +48,6 @@ TABLE = {
     "sleep": (0x13, 0x01, 0, "", 0),
     "deep sleep": (0x13, 0x00, 0, "", 0),
 }
-
-
-class Client:
-    """A plain bleak client that speaks frames."""
-
-    def __init__(self, bench) -> None:
-        self.bench = bench
-        self.packets: list[Packet] = []
-        self.pieces: list[bytes] = []
-        self.parser = PacketParser()
-        self.gone = asyncio.Event()
-        self.seq = 0
-
-    @contextlib.asynccontextmanager
-    async def open(self, *, words: bool = True):
-        radio = self.bench.radio
-        device = await BleakScanner.find_device_by_name("SB-1234", backend=radio.scanner_backend)
-        async with BleakClient(device, lambda _: self.gone.set(), backend=radio.client_backend) as self.client:
-            if words:
-                await self.client.write_gatt_char(ANTI_DOS_UUID, ANTI_DOS_WORDS, response=True)
-            await self.client.start_notify(COMMANDS_UUID, self._received)
-            yield self
-
-    def _received(self, _, chunk: bytearray) -> None:
-        self.pieces.append(bytes(chunk))
-        self.packets += self.parser.feed(chunk)
-
-    async def ask(self, request: Request, *, response: bool = True) -> Packet:
-        self.seq += 1
-        return await self.send(request.packet(self.seq), response=response)
-
-    async def send(self, packet: Packet, *, response: bool = True) -> Packet:
-        await self.client.write_gatt_char(COMMANDS_UUID, encode(packet), response=response)
-        async with asyncio.timeout(1.0):
-            while True:
-                for answer in self.packets:
-                    if answer.is_response and answer.seq == packet.seq:
-                        self.packets.remove(answer)
-                        return answer
-                await asyncio.sleep(0.001)
-
-
-def session(bench, script, **options) -> None:
-    async def main() -> None:
-        async with bench(connect=False, **options) as b, Client(b).open() as client:
-            await script(b, client)
-
-    run(main(), virtual=True)
 
 
 def test_every_command_of_the_table_with_right_short_and_long_payloads(bench) -> None:
@@ -252,52 +203,6 @@ def test_a_thousand_frames_come_at_the_interval_asked_for(bench, interval_ms: in
     session(bench, script)
 
 
-def test_yaw_locator_and_speed_are_those_of_the_body(bench) -> None:
-    async def script(b, client: Client) -> None:
-        names = ("yaw_deg", "locator_x_m", "locator_y_m", "velocity_x_m_s", "velocity_y_m_s", "speed_m_s")
-        layout = commands.layout_for(*names)
-        await client.ask(commands.stream(100, layout.primary))
-        await client.ask(commands.drive(50, np.pi / 2))
-        await asyncio.sleep(1.25)
-        yaw, x, y, vx, vy, speed = layout.decode(client.packets[-1].data)
-        assert yaw == pytest.approx(-90.0)
-        assert (vx, vy, speed) == pytest.approx((0.295, 0.0, 0.295), abs=1e-6)
-        assert y == pytest.approx(0.0, abs=1e-6)
-        assert 0.2 < x < 0.4
-        # 50 units are 29.5 cm/s; the last frame is less than one interval old.
-        assert b.body.distance_cm - 100 * x < 3.0
-
-    session(bench, script, facing_rad=0.0)
-
-
-def test_collisions_are_reported_only_when_asked_for(bench) -> None:
-    async def script(b, client: Client) -> None:
-        def collisions() -> list[Collision]:
-            return [Collision.decode(p.data) for p in client.packets if (p.did, p.cid) == commands.COLLISION.key]
-
-        async def ram(heading_rad: float) -> None:
-            for _ in range(5):
-                await client.ask(commands.drive(68, heading_rad))
-                await asyncio.sleep(1.0)
-
-        await ram(0.0)
-        assert b.body.pressed
-        assert collisions() == []
-        await client.ask(commands.collision_setup(1, (60, 60, 60, 60), 0.1))
-        await ram(np.pi)
-        (report,) = collisions()
-        # Head on: thrown back against the way it faces, and no stream was needed to say so.
-        assert report.y_g < -0.5
-        assert report.x_g == pytest.approx(0.0, abs=1e-3)
-        assert (report.axis, report.speed_units) == (2, 68)
-        assert report.t_robot_s < asyncio.get_running_loop().time()
-        await client.ask(commands.collision_setup(0, (60, 60, 60, 60), 0.1))
-        await ram(0.0)
-        assert len(collisions()) == 1
-
-    session(bench, script, facing_rad=0.0)
-
-
 def test_leds_show_in_the_body(bench) -> None:
     async def script(b, client: Client) -> None:
         await client.ask(commands.matrix_colour(0, 255, 0))
@@ -307,63 +212,6 @@ def test_leds_show_in_the_body(bench) -> None:
         assert b.body.led_level == pytest.approx(1 / 64)
 
     session(bench, script)
-
-
-@pytest.mark.parametrize("motors", ["01 1e 02 1e", "02 14 01 28", "01 32 00 00", "00 09 01 32"])
-def test_motors_that_differ_spin_it_on_the_spot(bench, motors: str) -> None:
-    async def script(b, client: Client) -> None:
-        data = bytes.fromhex(motors)
-        await client.ask(Request(commands.RAW_MOTORS, data))
-        told_s = asyncio.get_running_loop().time()
-        await asyncio.sleep(0.5)
-        b.body.advance(asyncio.get_running_loop().time())
-        left, right = ((0, units, -units)[mode] for mode, units in (data[:2], data[2:]))
-        turned_rad = 0.59 * (left - right) / 4.0 * (asyncio.get_running_loop().time() - told_s)
-        assert np.exp(1j * b.body.heading_rad) == pytest.approx(np.exp(1j * turned_rad), abs=0.02)
-        assert b.body.distance_cm == 0.0
-        # It stops like one that drives: by command, or for want of one.
-        await client.ask(Request(commands.RAW_MOTORS, bytes(4)))
-        facing_rad = b.body.facing_rad
-        await asyncio.sleep(1.0)
-        b.body.advance(asyncio.get_running_loop().time())
-        assert b.body.facing_rad == pytest.approx(facing_rad)
-
-    session(bench, script, facing_rad=0.0)
-
-
-def test_a_robot_that_hears_no_more_stops_by_itself(bench) -> None:
-    async def script(b, client: Client) -> None:
-        await client.ask(commands.drive(50, 0.0))
-        await asyncio.sleep(1.5)
-        await client.ask(commands.drive(50, 0.0))
-        told_s = asyncio.get_running_loop().time()
-        stood_s = np.inf
-        while not np.isfinite(stood_s):
-            await asyncio.sleep(0.01)
-            now_s = asyncio.get_running_loop().time()
-            b.body.advance(now_s)
-            if b.body.speed_cm_s == 0.0:
-                stood_s = now_s
-        # Two seconds, and the brake from 29.5 cm/s at 80 cm/s².
-        assert stood_s - told_s == pytest.approx(2.0 + 29.5 / 80.0, abs=0.02)
-
-    session(bench, script, position_cm=(-50.0, 0.0), facing_rad=0.0)
-
-
-def test_raw_motors_and_reverse_roll_it(bench) -> None:
-    async def script(b, client: Client) -> None:
-        await client.ask(Request(commands.RAW_MOTORS, bytes([1, 40, 1, 60])))
-        await asyncio.sleep(0.5)
-        assert b.body.x_cm > 2.0
-        await client.ask(Request(commands.RAW_MOTORS, bytes([0, 0, 0, 0])))
-        await asyncio.sleep(1.0)
-        x_cm = b.body.x_cm
-        await client.ask(commands.drive(50, 0.0, flags=0x01))
-        await asyncio.sleep(1.5)
-        assert b.body.x_cm < x_cm - 5.0
-        await client.ask(Request(commands.RAW_MOTORS, bytes([2, 40, 2, 40])))
-
-    session(bench, script, facing_rad=0.0)
 
 
 def test_a_host_that_does_not_say_the_words_is_dropped(bench) -> None:

@@ -1,7 +1,6 @@
 """How large faults are, what they do to area and perimeter, and how often the intervals hold."""
 
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -51,9 +50,9 @@ def measured(theta, p, shape, weight=None):
     return area / shape.area - 1, np.pi * area * k / l1 / shape.length - 1
 
 
-def report_of(theta, p):
-    """What `bias_from` reads of a report, without the tests."""
-    return SimpleNamespace(evidence=Evidence(theta, p, len(theta) * np.eye(14), 25.0))
+def evidence_of(theta, p):
+    """What `bias_from` reads of a report."""
+    return Evidence(theta, p, len(theta) * np.eye(14), 25.0)
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +71,7 @@ def test_invariants_are_those_of_all_pairs(shape):
 
 def test_right_lines_have_no_bias():
     theta, p, _ = thrown_at_arena(100_000, np.random.default_rng(3))
-    found = bias_from(report_of(theta, p), ARENA, TOWER)
+    found = bias_from(evidence_of(theta, p), ARENA, TOWER)
     assert abs(found.area_rel) < 3 * found.area_rel_sigma < 0.03
     assert abs(found.perimeter_rel) < 3 * found.perimeter_rel_sigma < 0.03
 
@@ -88,7 +87,7 @@ def test_bias_of_a_known_density(shape):
     theta, p, _ = thrown_at_arena(100_000, rng)
     weight = density(*uniforms(theta, p, ARENA))
     kept = rng.random(len(theta)) * 1.7 < weight
-    found = bias_from(report_of(theta[kept], p[kept]), ARENA, shape)
+    found = bias_from(evidence_of(theta[kept], p[kept]), ARENA, shape)
     some = slice(0, 8_000)
     weighted = measured(theta[some], p[some], shape, weight[some])
     right = measured(theta[some], p[some], shape)
@@ -104,10 +103,10 @@ def test_bias_of_a_uniform_angle_at_the_wall():
     truth = measured(theta.ravel(), p.ravel(), TOWER)
     assert truth[0] < -0.15
     assert truth[1] < -0.09
-    many = bias_from(report_of(theta.ravel(), p.ravel()), ARENA, TOWER)
+    many = bias_from(evidence_of(theta.ravel(), p.ravel()), ARENA, TOWER)
     assert many.area_rel == pytest.approx(truth[0], abs=0.05)
     assert many.perimeter_rel == pytest.approx(truth[1], abs=0.05)
-    few = [bias_from(report_of(*row), ARENA, TOWER) for row in zip(theta[:60], p[:60], strict=True)]
+    few = [bias_from(evidence_of(*row), ARENA, TOWER) for row in zip(theta[:60], p[:60], strict=True)]
     within = [abs(one.area_rel - many.area_rel) < 1.96 * one.area_rel_sigma for one in few]
     assert np.mean(within) > 0.75
 
@@ -147,7 +146,7 @@ def test_least_bias_shrinks_with_more_lines():
     found = []
     for n in (100, 400):
         rows = (a[0] for a in billiard(120, 90, 1, n, rng))
-        found.append(bias_from(examine_lines(*rows, ARENA, rng), ARENA, TOWER))
+        found.append(bias_from(examine_lines(*rows, ARENA, rng).evidence, ARENA, TOWER))
     assert found[1].least_area_rel == pytest.approx(found[0].least_area_rel / 2, rel=0.12)
     assert found[1].least_perimeter_rel == pytest.approx(found[0].least_perimeter_rel / 2, rel=0.12)
     assert set(json.loads(json.dumps(found[0].to_dict()))) == set(type(found[0]).__slots__)
@@ -157,7 +156,7 @@ def test_least_bias_shrinks_with_more_lines():
 def test_requests_that_cannot_be_met():
     theta, p, _ = thrown_at_arena(40, np.random.default_rng(9))
     with pytest.raises(TooFewHitsError, match="lines that meet the shape are too few") as caught:
-        bias_from(report_of(theta, p), ARENA, Point(0, 0).buffer(2))
+        bias_from(evidence_of(theta, p), ARENA, Point(0, 0).buffer(2))
     assert caught.value.hits < caught.value.needed == 10
     with pytest.raises(RequestError, match="no area within"):
-        bias_from(report_of(theta, p), ARENA, box(200, 200, 210, 210))
+        bias_from(evidence_of(theta, p), ARENA, box(200, 200, 210, 210))

@@ -22,9 +22,9 @@ from tracking.cameras import (
     CameraRequestError,
     Frame,
     chroma_planes,
-    open_camera,
     pack_i420,
 )
+from tracking.opening import open_camera
 from tracking.playback import FileCamera
 from tracking.usb import UsbCamera, UsbSettings
 from tracking.video import VideoError

@@ -175,7 +175,7 @@ def local_panel(name: str, read: Read) -> PaperPanel:
         name,
         figure,
         f"Local strategy: area and perimeter of {read.word} as the letters are added up, {letters[0].lines} lines each "
-        f"({read.lines} in all). The errors (bars, ± σ) add in squares: in the end {_percent(read, letters)} by the "
+        f"({read.lines} in all). The errors (bars, ± σ) add in squares: in the end {_percent(letters)} by the "
         "exact moments; over "
         f"{read.letter_runs.shape[1]} simulated runs {spread[0]:.2f} % of A and {spread[1]:.2f} % of P.",
         {"": table},
@@ -242,13 +242,13 @@ def global_panel(name: str, read: Read, strategies: Strategies | None) -> PaperP
         f"{100 * whole.sigma_area_cm2 / whole.area_cm2:.2f} % of A and "
         f"{100 * whole.sigma_perimeter_cm / whole.perimeter_cm:.2f} % of P by the exact moments ({spread[0]:.2f} and "
         f"{spread[1]:.2f} % over {len(last[0])} simulated runs); letter by letter, with as many lines, "
-        f"{_percent(read, letters)}.{_crossover(read, strategies)}",
+        f"{_percent(letters)}.{_crossover(strategies)}",
         {"": table} | ({"strategies": _strategies_table(strategies)} if strategies else {}),
         {"sigma_percent_simulated": spread, "crossover_words": strategies.crossover if strategies else None},
     )
 
 
-def _crossover(read: Read, strategies: Strategies | None) -> str:
+def _crossover(strategies: Strategies | None) -> str:
     if strategies is None:
         return ""
     sizes = "; ".join(
@@ -278,7 +278,7 @@ def _name_letters(axes: Axes, word: str) -> None:
     axes.set_xlim(-0.5, len(word) - 0.5)
 
 
-def _percent(read: Read, letters: Sequence[Measured]) -> str:
+def _percent(letters: Sequence[Measured]) -> str:
     area, perimeter = (
         100 * float(np.sqrt(sum(_sigma(m)[side] ** 2 for m in letters)) / sum(_size(m)[side] for m in letters))
         for side in (0, 1)

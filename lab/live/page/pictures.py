@@ -1,11 +1,10 @@
-"""The camera's pictures on the page: the LED found in the newest ones, or a stored session's frame of a moment."""
+"""The camera's pictures on the page: the newest of a running session, or a stored session's frame of a moment."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections import deque
-from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -15,62 +14,52 @@ from numpy.typing import NDArray
 
 from lab.base.errors import ChordlabError
 from lab.live.folder import StoryFolder
-from tracking.background import temporal_median
-from tracking.led import find_peaks
+from lab.live.page.eye import Eye, Place
 from tracking.video import read_frames
 
 Picture = NDArray[np.uint8]
-Place = tuple[float, float]
 _WIDTH = 480
-_LED_RADIUS_CM = 1.0
-_LEAST_RESPONSE = 3.0  # grey levels: a dimmed LED in a small picture
 _HALF_TICK_S = 0.002  # time stamps in the film are whole milliseconds
-_FLOORS = 15
-_FLOOR_EVERY = 10
-_TAIL = 25
+_TAIL = 5
+_FARTHEST_PX = 60.0  # between two looks; farther off it is another LED
 _LIT_COLOUR, _DARK_COLOUR, _BLACK, _WHITE = (84, 176, 255), (234, 180, 93), (0, 0, 0), (255, 255, 255)
 
 
-class Eye:
-    """Follows the LED in the pictures that the session sends, well enough for the eye; what counts is the film's track.
+class Newest:
+    """The pictures that a running session sends, with the LEDs in them marked.
 
     Args:
-        folder: the session's, for its calibration.
+        folder: the session's.
     """
 
     def __init__(self, folder: StoryFolder) -> None:
-        self._optics = folder.settings.camera_calibration()
-        self._height_cm = folder.settings.led.height_cm
-        self._floors: deque[Picture] = deque(maxlen=_FLOORS)
-        self._floor: Picture | None = None
-        self._tail: deque[Place] = deque(maxlen=_TAIL)
-        self._count = 0
+        self._eye = Eye(folder)
+        self._before: list[Place] = []
+        self._tail: deque[tuple[Place, Place]] = deque(maxlen=_TAIL * self._eye.leds)
 
-    def look(self, jpeg: bytes, *, lit: bool) -> tuple[bytes, Place | None]:
-        """Mark the LED in a picture. Returns the picture as JPEG, and where the LED is on the floor, cm."""
-        picture = cv2.imdecode(np.frombuffer(jpeg, dtype=np.uint8), cv2.IMREAD_COLOR)
-        if picture is None:
-            return jpeg, None
-        colour: Picture = np.asarray(picture, dtype=np.uint8)
-        red: Picture = np.ascontiguousarray(colour.max(axis=2))  # an LED of any colour is bright in one of them
-        if self._count % _FLOOR_EVERY == 0:
-            self._floors.append(red)
-            self._floor = temporal_median(list(self._floors))
-        self._count += 1
-        if self._floor is None or len(self._floors) < 3:
-            return jpeg, None
-        scale = self._optics.optics.image_size[0] / colour.shape[1]
-        spot_px = max(1.0, _LED_RADIUS_CM * float(self._optics.optics.camera_matrix[0, 0]) / 200.0 / scale)
-        peaks = find_peaks(red, self._floor, spot_px, least=_LEAST_RESPONSE)
-        if not peaks:
-            return jpeg, None
-        x_px, y_px, _ = peaks[0]
-        self._tail.append((x_px, y_px))
-        draw_led(colour, list(self._tail), lit=lit)
-        at = np.array([[(x_px + 0.5) * scale - 0.5, (y_px + 0.5) * scale - 0.5]])
-        x_cm, y_cm = self._optics.optics.to_plane(at, self._height_cm)[0]
-        place = (float(x_cm), float(y_cm)) if math.isfinite(x_cm) and math.isfinite(y_cm) else None
-        return _jpeg(colour), place
+    def mark(self, jpeg: bytes, *, lit: bool) -> tuple[bytes, list[tuple[float, float, bool]]]:
+        """Mark the LEDs in a picture; ``lit``: what the session says, for while nothing else tells.
+
+        Returns the picture as JPEG, and where the LEDs are on the floor, (x, y) cm, and whether they are lit.
+        """
+        read = cv2.imdecode(np.frombuffer(jpeg, dtype=np.uint8), cv2.IMREAD_COLOR)
+        if read is None:
+            return jpeg, []
+        picture: Picture = np.asarray(read, dtype=np.uint8)
+        spots = self._eye.look(picture)
+        states = self._eye.are_lit([spot.height for spot in spots], otherwise=lit)
+        here = [(spot.x_px, spot.y_px) for spot in spots]
+        for place in here:
+            last = min(self._before, key=lambda before: math.dist(before, place), default=place)
+            if 0 < math.dist(last, place) < _FARTHEST_PX:
+                self._tail.append((last, place))
+        self._before = here
+        for before, after in self._tail:
+            cv2.line(picture, _whole(before), _whole(after), _WHITE, 1, cv2.LINE_AA)
+        for place, shines in zip(here, states, strict=True):
+            draw_led(picture, place, lit=shines)
+        places = self._eye.on_the_floor(spots, picture.shape[1])
+        return _jpeg(picture), [(*place, shines) for place, shines in zip(places, states, strict=True)]
 
 
 class Film:
@@ -85,8 +74,9 @@ class Film:
         self._segments = folder.session.segments()
         self._track: pd.DataFrame | None = None
         try:
-            path = folder.session.path("track.parquet")
-            self._track = pd.read_parquet(path, columns=["t_s", "x_px", "y_px", "led_on"]).sort_values("t_s")
+            track = pd.read_parquet(folder.session.path("track.parquet"))
+            columns = [name for name in ("t_s", "x_px", "y_px", "led_on", "robot") if name in track]
+            self._track = track[columns].sort_values("t_s")
         except (OSError, ValueError, KeyError, ChordlabError):
             self._track = None
 
@@ -124,17 +114,21 @@ class Film:
             return
         past = self._track[(self._track["t_s"] > t_s - 2.0) & (self._track["t_s"] <= t_s + 0.01)]
         seen = past[np.isfinite(np.asarray(past["x_px"], dtype=float))]
-        if len(seen):
-            places = (np.asarray(seen[["x_px", "y_px"]], dtype=float) * scale).tolist()
-            draw_led(picture, [(float(x), float(y)) for x, y in places], lit=bool(seen["led_on"].iloc[-1]))
+        for _, own in seen.groupby("robot") if "robot" in seen else [(0, seen)]:
+            if not len(own):
+                continue
+            places: list[Place] = [
+                (float(x) * scale, float(y) * scale) for x, y in np.asarray(own[["x_px", "y_px"]], dtype=float)
+            ]
+            for before, after in itertools.pairwise(places):
+                if math.dist(before, after) < _FARTHEST_PX:
+                    cv2.line(picture, _whole(before), _whole(after), _WHITE, 1, cv2.LINE_AA)
+            draw_led(picture, places[-1], lit=bool(own["led_on"].iloc[-1]))
 
 
-def draw_led(picture: Picture, tail: Sequence[Place], *, lit: bool) -> None:
-    """Draw where the LED has been and is: a full ring where it is lit, an open one where it is dark."""
-    for before, after in itertools.pairwise(tail):
-        if math.dist(before, after) < 40:
-            cv2.line(picture, _whole(before), _whole(after), _WHITE, 1, cv2.LINE_AA)
-    here = _whole(tail[-1])
+def draw_led(picture: Picture, place: Place, *, lit: bool) -> None:
+    """Draw where an LED is: a full ring where it is lit, an open one where it is dark."""
+    here = _whole(place)
     cv2.circle(picture, here, 11, _BLACK, 4, cv2.LINE_AA)
     cv2.circle(picture, here, 11, _LIT_COLOUR if lit else _DARK_COLOUR, 2, cv2.LINE_AA)
     if lit:

@@ -8,6 +8,7 @@ import os
 import signal
 import socket
 import sys
+import time
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -21,10 +22,11 @@ from nicegui import ui
 from lab.live.channel import Ends
 from lab.live.page.guard import Guard
 from lab.live.page.source import Source
-from lab.live.page.view import build
+from lab.live.page.view import build, is_looked_at
 
 _REFRESH_EVERY_S = 0.2
-_LAST_LOOK_S = 2.0
+_LOOK_EVERY_S = 1.0
+_LAST_LOOKS = 12
 _NICENESS = 5
 
 
@@ -71,10 +73,17 @@ def serve(source: Source, bound: socket.socket, *, host: str, token: str) -> Non
 
 
 async def _follow(source: Source, server: uvicorn.Server) -> None:
-    """Keep the source fresh; when the session is gone, let the pages take a last look and end."""
+    """Keep the source fresh, and tell the session while somebody looks; when it is gone, let the pages part and end."""
+    next_look_s = 0.0
     while not source.session_gone.is_set():
+        if time.monotonic() > next_look_s and is_looked_at():
+            next_look_s = time.monotonic() + _LOOK_EVERY_S
+            source.command({"do": "look"})
         await asyncio.to_thread(source.refresh)
         await asyncio.sleep(_REFRESH_EVERY_S)
     await asyncio.to_thread(source.refresh)
-    await asyncio.sleep(_LAST_LOOK_S)
+    for _ in range(_LAST_LOOKS):
+        if not is_looked_at():
+            break
+        await asyncio.sleep(_REFRESH_EVERY_S)
     server.should_exit = True

@@ -9,12 +9,13 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from lab.base.errors import ChordlabError
+from lab.live import charts
 from lab.live.channel import Command, Ends, read_news, send_command
 from lab.live.folder import NOTHING_SEEN, Sightings, StoryFolder
-from lab.live.page.pictures import Eye, Film
+from lab.live.page.figures import Drawings, draw
+from lab.live.page.pictures import Film, Newest
+from lab.live.page.trail import Trail
 from lab.live.story import Moment
 
 _LARGEST_MESSAGE = 1 << 16
@@ -32,25 +33,30 @@ class Source:
     Attributes:
         folder: the session that is shown, once there is one.
         version: grows whenever there is something new to draw.
+        log_version: grows with the log and what follows from it.
         trouble: why nothing is shown, in words.
+        light: each robot's newest light samples, (t_s, lux).
         session_gone: whether the running session's process has left.
     """
 
     def __init__(self, ends: Ends | None = None, folder: Path | None = None) -> None:
         self.folder: StoryFolder | None = None
-        self.version = 0
+        self.version = self.log_version = self.picture_number = 0
         self.trouble = ""
         self.session_gone = threading.Event()
-        self.light: deque[tuple[float, float]] = deque(maxlen=_KEPT_LIGHT)
+        self.light: dict[str, deque[tuple[float, float]]] = {}
         self._ends = ends
         self._lock = threading.Lock()
         self._news: dict[str, Any] = {}
         self._picture: tuple[float, bool, bytes] | None = None
         self._shown: bytes | None = None
-        self._eye: Eye | None = None
+        self._newest: Newest | None = None
         self._film: Film | None = None
+        self._trail: Trail | None = None
         self._seen: deque[tuple[float, float, float, bool]] = deque(maxlen=_KEPT_PLACES)
-        self._sightings: Sightings = NOTHING_SEEN
+        self._track: Sightings = NOTHING_SEEN
+        self._drawn: dict[charts.Ink, tuple[tuple[object, ...], Drawings]] = {}
+        self._films = 0
         self._frames: tuple[float, bytes | None] = (math.nan, None)
         if folder is not None:
             self._open(folder)
@@ -60,8 +66,8 @@ class Source:
 
     @property
     def is_live(self) -> bool:
-        """Whether there is a running session behind it that takes commands."""
-        return self._ends is not None and not self.session_gone.is_set()
+        """Whether it is the source of a running session, even where that has left, and not of a stored one."""
+        return self._ends is not None
 
     def news(self, name: str, otherwise: Any = None) -> Any:
         """The newest that the running session has told under a name."""
@@ -69,7 +75,7 @@ class Source:
 
     def batteries(self, moment: Moment) -> dict[str, float]:
         """Each robot's battery, V, newest."""
-        robots: dict[str, Any] = self.news("robots", {}) if self.is_live else {}
+        robots: dict[str, Any] = self.news("robots", {})
         told = {name: float(robot["battery_v"]) for name, robot in robots.items() if robot.get("battery_v")}
         return {**moment.battery_v, **told}
 
@@ -87,24 +93,39 @@ class Source:
             return
         try:
             if folder.read():
-                self.version += 1
+                self._grow()
         except ChordlabError as error:
             self._fail(str(error))
         with self._lock:
             picture, self._picture = self._picture, None
-        if picture is not None and folder.has_camera:
-            self._look(folder, *picture)
+        if picture is not None and self._newest is not None:
+            self._look(self._newest, *picture)
+        if self._trail is not None and self._trail.films != self._films:
+            self._films = self._trail.films
+            self._grow()
 
     def moment(self, t_s: float = math.inf) -> Moment | None:
         """What was known of the session at a time; None before there is a session."""
         return None if self.folder is None else self.folder.story.at(t_s)
 
+    def drawings(self, t_s: float, ink: charts.Ink) -> Drawings | None:
+        """The figures of a time, drawn once for all pages that show them alike; None before there is a session."""
+        folder, moment = self.folder, self.moment(t_s)
+        if folder is None or moment is None:
+            return None
+        key = (folder, self.log_version, moment.t_s, len(self._seen))
+        held = self._drawn.get(ink)
+        if held is None or held[0] != key:
+            held = self._drawn[ink] = (key, draw(folder, moment, self.sightings(t_s), ink))
+        return held[1]
+
     def sightings(self, t_s: float) -> Sightings:
-        """Where the LED was seen up to a time."""
-        if not self._seen:
-            return self._sightings.until(t_s)
-        times, x_cm, y_cm, lit = zip(*tuple(self._seen), strict=True)
-        return Sightings(np.array(times), np.array(x_cm), np.array(y_cm), np.array(lit, dtype=bool))
+        """Where LEDs were seen up to a time: in the films, and since the last film in the newest pictures."""
+        if self._trail is None:
+            return self._track.until(t_s)
+        filmed = self._trail.sightings()
+        since_s = filmed.t_s[-1] if len(filmed.t_s) else -math.inf
+        return filmed.and_then([seen for seen in tuple(self._seen) if seen[0] > since_s]).until(t_s)
 
     def picture(self, t_s: float) -> bytes | None:
         """The camera's picture with the LED marked: the newest of a running session, or that of a time."""
@@ -125,19 +146,28 @@ class Source:
             return
         self.trouble = ""
         self._seen.clear()
-        self.light.clear()
-        self._shown = None
-        if self._ends is None:
-            self._film = Film(folder) if folder.has_camera else None
-            self._sightings = folder.sightings()
+        self.light = {}
+        self._shown = self._newest = self._film = None
+        if self._trail is not None:
+            self._trail.give_up()
+        self._track = folder.sightings()
+        self._trail = Trail(folder) if folder.has_camera and not len(self._track.t_s) else None
+        if self._trail is not None:
+            self._trail.start()
+        if folder.has_camera and self.is_live:
+            self._newest = Newest(folder)
         elif folder.has_camera:
-            self._eye = Eye(folder)
-        self.version += 1
+            self._film = Film(folder)
+        self._grow()
         threading.Thread(target=self._learn, args=(folder,), name="chordlab-names", daemon=True).start()
 
     def _learn(self, folder: StoryFolder) -> None:
         with contextlib.suppress(ChordlabError):  # the log's own leading name stays
             folder.learn_names()
+        self._grow()
+
+    def _grow(self) -> None:
+        self.log_version += 1
         self.version += 1
 
     def _fail(self, trouble: str) -> None:
@@ -145,12 +175,10 @@ class Source:
             self.trouble = trouble
             self.version += 1
 
-    def _look(self, folder: StoryFolder, t_s: float, lit: bool, jpeg: bytes) -> None:
-        robots: dict[str, Any] = self.news("robots", {})
-        eye = self._eye = self._eye or Eye(folder)
-        self._shown, place = eye.look(jpeg, lit=lit)
-        if place is not None and len(robots) <= 1:
-            self._seen.append((t_s, *place, lit))
+    def _look(self, newest: Newest, t_s: float, lit: bool, jpeg: bytes) -> None:
+        self._shown, places = newest.mark(jpeg, lit=lit)
+        self._seen.extend((t_s, *place) for place in places if math.isfinite(place[0]) and math.isfinite(place[1]))
+        self.picture_number += 1
         self.version += 1
 
     def _hear(self, ends: Ends) -> None:
@@ -165,7 +193,9 @@ class Source:
                 if head.get("kind") == "picture":
                     self._picture = (float(head["t_s"]), bool(head["lit"]), body)
                 else:
-                    self.light.extend((float(t_s), float(lux)) for t_s, lux in head.pop("light", []))
+                    for robot, samples in head.pop("light", {}).items():
+                        light = self.light.setdefault(robot, deque(maxlen=_KEPT_LIGHT))
+                        light.extend((float(t_s), float(lux)) for t_s, lux in samples)
                     self._news = head
                     self.version += 1
 
