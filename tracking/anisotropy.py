@@ -155,10 +155,10 @@ class ShapeBias:
 
     def sentence(self) -> str:
         """In plain words: what the lines do to this shape, and what could still hide."""
-        area, perimeter = 100 * self.area_rel, 100 * self.perimeter_rel
+        area, perimeter = (f"{100 * off:+.1f}".replace("-", "−") for off in (self.area_rel, self.perimeter_rel))
         return (
-            f"By these lines alone the shape's area comes out {area:+.1f} ± {100 * self.area_rel_sigma:.1f} % and its "
-            f"perimeter {perimeter:+.1f} ± {100 * self.perimeter_rel_sigma:.1f} % off; an uneven spread too weak to be "
+            f"By these lines alone the shape's area comes out {area} ± {100 * self.area_rel_sigma:.1f} % and its "
+            f"perimeter {perimeter} ± {100 * self.perimeter_rel_sigma:.1f} % off; an uneven spread too weak to be "
             f"found could cause at worst {100 * self.least_area_rel:.0f} % and {100 * self.least_perimeter_rel:.0f} %."
         )
 

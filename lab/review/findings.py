@@ -192,7 +192,9 @@ def _warnings(found: Reviewed) -> list[str]:
         bumps = {str(robot): own["t_end_s"].tolist() for robot, own in met.groupby("robot")}
         flags, by_chance = contacts_among(bumps, CONTACT_WINDOW_S)
         contacts, walls = sum(map(sum, flags.values())), sum(by_chance.values())
-        said.append(f"The robots met {contacts} times, some {walls:.0f} of which were walls hit by two at once.")
+        said.append(
+            f"The robots met {contacts} times; some {walls:.0f} of these may be two robots at walls at the same moment."
+        )
     if found.filmed is not None:
         unseen = int(lines["counts"].sum()) - len(found.filmed.lines)
         if unseen > 0.05 * len(lines):

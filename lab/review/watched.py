@@ -147,7 +147,8 @@ def watch(
             step[row] = way_cm / (len(places) - 1 - settled)
             jitter[row] = read.stamp_variance_s2() * (way_cm / time_s) ** 2
         if line in own:
-            moved.append(own[line].assign(s_cm=_places(np.asarray(own[line]["t_s"], dtype=float), t_s, s_cm)))
+            crossed_s = np.asarray(own[line]["t_s"], dtype=float)
+            moved.append(own[line].assign(s_cm=places_at(crossed_s, t_s, s_cm, lengths[row])))
     fallback_cm = settings.motion.speed_cm_s * settings.sensor.interval_s
     step[~(step > 0)] = float(np.median(step[step > 0])) if (step > 0).any() else fallback_cm
     return Watched(
@@ -168,11 +169,14 @@ def _pass(line: pd.Series) -> tuple[float, float, float, float]:
     return float(line["theta_rad"]), float(line["p_cm"]), float(begin), float(end)
 
 
-def _places(t_s: Floats, known_t_s: Floats, known_cm: Floats) -> Floats:
-    """Places at times; before the first and after the last known one by the mean speed."""
+def places_at(t_s: Floats, known_t_s: Floats, known_cm: Floats, length_cm: float) -> Floats:
+    """Places along a run in cm at times in s; before the first and after the last known one by the mean speed.
+
+    None lies off the run: what was felt a moment before the film saw it begin is at its begin.
+    """
     speed = (known_cm[-1] - known_cm[0]) / (known_t_s[-1] - known_t_s[0])
     beyond = np.maximum(t_s - known_t_s[-1], 0.0) - np.maximum(known_t_s[0] - t_s, 0.0)
-    return np.interp(t_s, known_t_s, known_cm) + speed * beyond
+    return np.clip(np.interp(t_s, known_t_s, known_cm) + speed * beyond, 0.0, length_cm)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,6 +13,8 @@ from lab.cli.main import main
 from lab.cli.output import show_table
 from lab.store.reader import SessionReader
 
+SAMPLES = Path(__file__).parents[2] / "data" / "sessions"
+
 
 @pytest.fixture
 def say(capsys):
@@ -181,9 +183,13 @@ def test_validate_a_filmed_session(say, filmed_session):
         for path in SessionReader(filmed_session.folder).segments().values()
     )
     assert len(track) == len(films)
-    code, out, err = say("validate", filmed_session.folder, "--no-report")
+
+
+def test_validate_without_a_report_elsewhere(say, tmp_path):
+    code, out, err = say("validate", SAMPLES / "square-filmed", "--no-report", "--out", tmp_path)
     assert (code, err) == (0, "")
-    assert "chords" in out
+    assert "chords: 16 matched" in out
+    assert not (tmp_path / "report.html").exists()
 
 
 def test_validate_without_video_says_so(say, square_session):

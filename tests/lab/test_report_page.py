@@ -29,7 +29,8 @@ def reports(square_session, filmed_session, uniform_session, tmp_path_factory):
     made = {}
     for name, session in (("filmed", filmed_session), ("blind", square_session), ("wrong", uniform_session)):
         made[name] = review(shutil.copytree(session.folder, folder / name), report=True)["report"]
-    made["batch"] = write_sheet(sample_batch.batch(400), pd.DataFrame(), folder / "batch.html")
+    for name, sessions in (("batch", 40), ("many", 400)):
+        made[name] = write_sheet(sample_batch.batch(sessions), pd.DataFrame(), folder / f"{name}.html")
     return made
 
 
@@ -69,7 +70,7 @@ def look(browser, reports):
 NAMES = ("filmed", "blind", "wrong", "batch")
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [*NAMES, "many"])
 def test_a_report_is_one_file_of_less_than_5_mb(look, reports, name):
     page, asked = look(name)
     assert [url for url in asked if not url.startswith("data:")] == [reports[name].as_uri()]
@@ -137,6 +138,10 @@ def test_the_verdict_comes_first_and_every_table_names_its_columns(look, name):
         "[...table.tHead.rows[0].cells].slice(1).some(cell => !cell.innerText.trim())).map(table => table.id)"
     )
     assert nameless == []
+    heads = page.evaluate(  # the words of a command stand one behind the other
+        "[...document.querySelectorAll('code span:first-child')].map(word => getComputedStyle(word).display)"
+    )
+    assert set(heads) <= {"inline"}
     words = page.locator("main").inner_text()
     record = page.evaluate("[...document.querySelectorAll('.record, #provenance, code')].map(e => e.innerText).join()")
     assert [found for found in re.findall(r"(?<![\w−-])-\d\S*", words) if found not in record] == []

@@ -132,7 +132,7 @@ def test_what_a_session_was_begun_with_cannot_be_changed(tmp_path, capfd, more):
     assert main(["run", *more, "--resume", str(tmp_path)]) == 2
     told = capfd.readouterr().err
     assert f"{more[0]} is not for --resume" in " ".join(told.split())
-    assert told.count("chordlab:") == 1
+    assert told.count("error:") == 1
 
 
 # --- the command --------------------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ from shapely import Polygon
 
 from lab.review.attribution import attribute, lines_from_the_edge
 from lab.review.review import review
+from lab.review.watched import places_at
 from lab.settings.load import load_settings
 from lab.store.reader import SessionReader
 from tests.lab.traces import rolled
@@ -78,6 +79,12 @@ def test_validate_works_with_all_of_them(filmed, reviewed):
     assert abs(robot["area_cm2"] - camera["area_cm2"]) < 0.5 * robot["sigma_area_cm2"]
     assert reviewed["isotropy"] is not None
     assert "was run without video" not in reviewed["report"].read_text(encoding="utf-8")
+
+
+def test_what_was_felt_before_the_film_saw_a_run_begin_is_at_its_begin():
+    """A run that a contact begins in the light may be left so soon that it lay 5 cm before the begin."""
+    felt_s, seen_s, seen_cm = np.array([-0.2, 2.0, 3.04, 9.0]), np.array([1.0, 3.0]), np.array([0.2, 20.2])
+    assert places_at(felt_s, seen_s, seen_cm, 20.4) == pytest.approx([0.0, 10.2, 20.4, 20.4])
 
 
 def test_a_track_is_attributed_by_time():

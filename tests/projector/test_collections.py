@@ -5,7 +5,7 @@ import pytest
 from shapely.geometry import box
 
 from lab.base.errors import ChordlabError, RequestError
-from projector import collections
+from projector import catalogue
 from projector.collections import COLLECTIONS, LETTERS, charter_words, load_dictionary
 from projector.dictionary import check_fits, shape_from
 from projector.draw import draw_gallery
@@ -90,7 +90,7 @@ def test_a_collection_that_is_none():
 def test_an_installation_that_lacks_files(tmp_path, monkeypatch):
     package = tmp_path / "projector"
     (package / "shapes" / "monuments").mkdir(parents=True)
-    monkeypatch.setattr(collections, "__file__", str(package / "collections.py"))
+    monkeypatch.setattr(catalogue, "__file__", str(package / "catalogue.py"))
     for missing in ("paper", "monuments", "words"):
         with pytest.raises(ChordlabError, match="install chordlab again"):
             load_dictionary(missing)
@@ -100,7 +100,7 @@ def test_two_shapes_of_one_name_are_told(tmp_path, monkeypatch):
     shapes = tmp_path / "projector" / "shapes"
     (shapes / "monuments").mkdir(parents=True)
     square = shape_from("square")
-    monkeypatch.setattr(collections, "__file__", str(tmp_path / "projector" / "collections.py"))
+    monkeypatch.setattr(catalogue, "__file__", str(tmp_path / "projector" / "catalogue.py"))
     write_shape(square, shapes / "square.geojson")
     write_shape(square, shapes / "monuments" / "block.geojson")
     (shapes / "words").mkdir()

@@ -8,7 +8,7 @@ from shapely.affinity import rotate
 from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
 
 from lab.base.errors import ChordlabError
-from projector import collections
+from projector import catalogue
 from projector.dictionary import ShapeError, check_fits, load_dictionary, shape_from
 from projector.draw import draw_shape
 from projector.geojson import write_shape
@@ -189,7 +189,7 @@ def test_installed_wheel_finds_its_shapes_beside_the_module(tmp_path, monkeypatc
     package = tmp_path / "projector"
     (package / "shapes").mkdir(parents=True)
     write_shape(shapes["square"], package / "shapes" / "square.geojson")
-    monkeypatch.setattr(collections, "__file__", str(package / "collections.py"))
+    monkeypatch.setattr(catalogue, "__file__", str(package / "catalogue.py"))
     assert list(load_dictionary()) == ["square"]
     (package / "shapes" / "square.geojson").unlink()
     with pytest.raises(ChordlabError, match="holds no"):

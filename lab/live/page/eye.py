@@ -52,6 +52,9 @@ class Eye:
         self.leds = len(folder.settings.robots)
         self._optics = folder.settings.camera_calibration().optics
         self._height_cm = led.height_cm
+        x_px, y_px = self._optics.image_size[0] / 2, self._optics.image_size[1] / 2
+        one, next_to_it = self._optics.to_plane(np.array([[x_px, y_px], [x_px + 1, y_px]]), led.height_cm)
+        self._cm_per_px = float(np.hypot(*(next_to_it - one)))
         self._ratio = _TWO_LEVELS * led.lit_level / led.dark_level if led.dark_level > 0 else np.inf
         self._floors: deque[Picture] = deque(maxlen=_FLOORS)
         self._floor: Picture | None = None
@@ -67,8 +70,7 @@ class Eye:
         self._count += 1
         if self._floor is None or len(self._floors) < _LEAST_FLOORS:
             return []
-        px_per_cm = float(self._optics.camera_matrix[0, 0]) / 200.0 / self._scale(picture.shape[1])
-        radius_px = max(1.0, _LED_RADIUS_CM * px_per_cm)
+        radius_px = max(1.0, _LED_RADIUS_CM / (self._cm_per_px * self._scale(picture.shape[1])))
         peaks = find_peaks(bright, self._floor, radius_px, count=self.leds, least=_LEAST_RESPONSE)
         self._heights.extend(height for _, _, height in peaks)
         return [Spot(*peak) for peak in peaks]

@@ -12,7 +12,7 @@ import time
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import uvicorn
 from fastapi import FastAPI
@@ -63,6 +63,8 @@ def serve(source: Source, bound: socket.socket, *, host: str, token: str) -> Non
     run_with: Any = ui.run_with  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
     run_with(outer, title="chordlab", show_welcome_message=False, language="en-US", tailwind=False)
     nicegui_app.config.socket_io_js_transports = ["websocket", "polling"]
+    quasar = cast("dict[str, dict[str, Any]]", nicegui_app.config.quasar_config)  # pyright: ignore[reportUnknownMemberType]
+    quasar["loadingBar"]["skipHijack"] = True  # a bar without a name, at every request
     guarded = Guard(outer, host=host, port=int(bound.getsockname()[1]), token=token)
     config = uvicorn.Config(
         guarded, log_level="error", access_log=False, timeout_graceful_shutdown=1, ws="websockets-sansio"
