@@ -10,6 +10,7 @@ import pickle
 import queue
 import time
 import uuid
+import warnings
 from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from lab.spread.versions import Versions, differences, versions
 
 try:
     from distributed import Client, Future, KilledWorker
+    from distributed.versions import VersionMismatchWarning
 except ImportError as error:
     raise RequestError("a cluster needs Dask's distributed: pip install 'chordlab[cluster]'") from error
 
@@ -203,7 +205,9 @@ def _name_of(task: Callable[..., Any]) -> str:
 def _connected(scheduler: str) -> Generator[Client]:
     """A client of a scheduler. Raises RequestError when it cannot be reached."""
     try:
-        client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False, name="chordlab")
+        with warnings.catch_warnings():  # other versions are refused in one line by what asks for them here
+            warnings.simplefilter("ignore", VersionMismatchWarning)
+            client = Client(scheduler, timeout=_CONNECT_S, set_as_default=False, name="chordlab")
     except (OSError, TimeoutError, ValueError) as error:
         raise RequestError(
             f"{scheduler}: no scheduler answers there within {_CONNECT_S:.0f} s; "

@@ -19,7 +19,7 @@ from lab.live.server import listen, page_server
 from lab.session.experiment import run_experiment
 from lab.settings.load import load_settings
 from tests.lab.conftest import STARTED
-from tests.lab.pages import CHROMIUM, need_chromium
+from tests.lab.pages import a_browser
 
 LINES, FILMED_LINES, ROUNDS, PAGES = 30, 3, 3, 3
 FOR_THE_PAGE = {"none": ("sample",), "virtual": ("sample", "frame")}
@@ -56,13 +56,9 @@ def timed(live, camera):
 
 @pytest.mark.parametrize("camera", ["none", "virtual"])
 def test_a_session_with_pages_open(benchmark, tmp_path, camera):
-    need_chromium()
-    from playwright.sync_api import sync_playwright
-
     rolled(tmp_path / "warm", camera, None)
     alone, watched = [], []
-    with page_server(listen()) as server, sync_playwright() as playwright, ThreadPoolExecutor(1) as elsewhere:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+    with page_server(listen()) as server, a_browser() as chromium, ThreadPoolExecutor(1) as elsewhere:
         pages = [chromium.new_page() for _ in range(PAGES)]
         for page in pages:
             page.goto(server.url, timeout=120_000)
@@ -75,7 +71,6 @@ def test_a_session_with_pages_open(benchmark, tmp_path, camera):
         for page in pages:  # they did look
             page.wait_for_function("parseInt(document.querySelector('.facts dd').innerText) > 0", timeout=60_000)
             assert camera == "none" or page.evaluate("document.querySelector('img.camera').naturalWidth") > 0
-        chromium.close()
     assert spent[0] > 0
     benchmark.extra_info["pages"] = PAGES
     benchmark.extra_info["for_the_page_of_thread_percent"] = 100 * spent[0] / took[1]

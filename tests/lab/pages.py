@@ -1,5 +1,6 @@
 """Commands that serve pages, as a user starts them, and a browser that looks at them."""
 
+import asyncio
 import json
 import os
 import queue
@@ -19,11 +20,24 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 _FIRST_WORD_S = 60
 
 
-def need_chromium():
-    """Skip where there is no Chromium; in CI there is one, and its lack a failure."""
+@contextmanager
+def a_browser():
+    """Chromium without a window; while it is open, this thread's event loop is the browser's.
+
+    Skipped where there is none; in CI there is one, and its lack a failure.
+    """
     if CHROMIUM is None and os.environ.get("CI") != "true":
         pytest.skip("no chromium in the path; install Debian's package to test the page")
     assert CHROMIUM is not None, "CI needs the package chromium"
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(
+            executable_path=CHROMIUM, args=["--no-sandbox", "--disable-background-networking"]
+        )
+        yield chromium
+        chromium.close()
+    asyncio.set_event_loop(None)
 
 
 @dataclass

@@ -1,6 +1,5 @@
 """The page in a real browser: a session led from it, a stored one scrubbed, and no harm to either."""
 
-import asyncio
 import os
 import re
 import signal
@@ -12,7 +11,7 @@ import pytest
 from lab.live.words import with_error
 from lab.store.reader import SessionReader
 from lab.store.tables import tables_of
-from tests.lab.pages import CHROMIUM, chart_data, fact, log_of, need_chromium, serving, until
+from tests.lab.pages import a_browser, chart_data, fact, log_of, serving, until
 
 TOKEN = "let-me-in"
 HEADLINE = "document.querySelector('.headline').innerText"
@@ -20,16 +19,8 @@ HEADLINE = "document.querySelector('.headline').innerText"
 
 @pytest.fixture(scope="module")
 def browser(square_session):  # which must be rolled before: the browser's loop runs in this thread from here on
-    need_chromium()
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(
-            executable_path=CHROMIUM, args=["--no-sandbox", "--disable-background-networking"]
-        )
+    with a_browser() as chromium:
         yield chromium
-        chromium.close()
-    asyncio.set_event_loop(None)
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,5 @@
 """The reports in a real browser: whole without the net, readable by all, on a phone, in the dark and on paper."""
 
-import asyncio
 import re
 import shutil
 from pathlib import Path
@@ -16,7 +15,7 @@ from lab.review.history import history_of
 from lab.review.review import review
 from lab.settings.settings import Settings
 from tests.analysis import sample_batch
-from tests.lab.pages import CHROMIUM, need_chromium
+from tests.lab.pages import a_browser
 
 MOST_BYTES = 5_000_000
 A4_PX = {"width": 698, "height": 1000}  # 18.5 cm between the margins, at 96 dots an inch
@@ -36,16 +35,8 @@ def reports(square_session, filmed_session, uniform_session, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def browser(reports):  # which must be made before: the browser's loop runs in this thread from here on
-    need_chromium()
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(
-            executable_path=CHROMIUM, args=["--no-sandbox", "--disable-background-networking"]
-        )
+    with a_browser() as chromium:
         yield chromium
-        chromium.close()
-    asyncio.set_event_loop(None)
 
 
 @pytest.fixture
