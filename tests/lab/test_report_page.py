@@ -1,7 +1,6 @@
 """The reports in a real browser: whole without the net, readable by all, on a phone, in the dark and on paper."""
 
 import re
-import shutil
 from pathlib import Path
 
 import pandas as pd
@@ -17,17 +16,19 @@ from lab.settings.settings import Settings
 from tests.analysis import sample_batch
 from tests.lab.pages import a_browser
 
+SAMPLES = Path(__file__).parents[2] / "data" / "sessions"
 MOST_BYTES = 5_000_000
 A4_PX = {"width": 698, "height": 1000}  # 18.5 cm between the margins, at 96 dots an inch
 
 
 @pytest.fixture(scope="module")
-def reports(square_session, filmed_session, uniform_session, tmp_path_factory):
+def reports(square_session, uniform_session, tmp_path_factory):
     """The page of a session with film, of one without, of one that turned wrongly, and of a batch of many."""
     folder = tmp_path_factory.mktemp("reports")
     made = {}
-    for name, session in (("filmed", filmed_session), ("blind", square_session), ("wrong", uniform_session)):
-        made[name] = review(shutil.copytree(session.folder, folder / name), report=True)["report"]
+    stored = {"filmed": SAMPLES / "square-filmed", "blind": square_session.folder, "wrong": uniform_session.folder}
+    for name, session in stored.items():
+        made[name] = review(session, report=True, out=folder / name)["report"]
     for name, sessions in (("batch", 40), ("many", 400)):
         made[name] = write_sheet(sample_batch.batch(sessions), pd.DataFrame(), folder / f"{name}.html")
     return made
