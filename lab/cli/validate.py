@@ -38,7 +38,7 @@ def validate(
     _check_apart(folder, out)
     with progress_bar("tracking the video", quiet=quiet) as update:
         summary = review(folder, report=report, out=out, progress=update)
-    if report and out is None:
+    if out is None:
         write_checksums(folder)
     if as_json:
         emit(summary)

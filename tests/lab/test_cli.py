@@ -12,6 +12,7 @@ import pytest
 from lab.cli.main import main
 from lab.cli.output import show_table
 from lab.store.reader import SessionReader
+from lab.store.seal import verify_checksums, write_checksums
 
 SAMPLES = Path(__file__).parents[2] / "data" / "sessions"
 
@@ -185,11 +186,16 @@ def test_validate_a_filmed_session(say, filmed_session):
     assert len(track) == len(films)
 
 
-def test_validate_without_a_report_elsewhere(say, tmp_path):
-    code, out, err = say("validate", SAMPLES / "square-filmed", "--no-report", "--out", tmp_path)
+def test_validate_seals_what_it_found_without_a_report_too(say, tmp_path):
+    folder = Path(shutil.copytree(SAMPLES / "square-filmed", tmp_path / "copy"))
+    (folder / "track.parquet").unlink()
+    write_checksums(folder)
+    code, out, err = say("validate", folder, "--no-report")
     assert (code, err) == (0, "")
     assert "chords: 16 matched" in out
-    assert not (tmp_path / "report.html").exists()
+    assert not (folder / "report.html").exists()
+    assert " track.parquet" in (folder / "SHA256SUMS").read_text()
+    assert verify_checksums(folder) == []
 
 
 def test_validate_without_video_says_so(say, square_session):
