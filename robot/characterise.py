@@ -19,26 +19,9 @@ import numpy as np
 from robot.crossings import LevelsError, learn_levels
 from robot.device import Bump
 from robot.errors import RobotError
-from robot.finding import Finding, applied, comments_of
+from robot.finding import Finding
 from robot.fitting import TURN, AxesFound, Figure, Hit, WallSeen, axes_of, latency_of, mean_of, onset_s, wall_through
-from robot.trial import FINEST_S, GIVE_UP_S, MOVED_CM, CharacteriseError, Roll, Trial, neutral
-
-__all__ = [
-    "CharacteriseError",
-    "Finding",
-    "Roll",
-    "Trial",
-    "applied",
-    "collision_axes",
-    "comments_of",
-    "least_interval",
-    "least_speed",
-    "light_latency",
-    "light_levels",
-    "motion_latency",
-    "neutral",
-    "roll_runs",
-]
+from robot.trial import FINEST_S, GIVE_UP_S, MOVED_CM, Roll, Trial
 
 Show = Callable[[float], None]
 Say = Callable[[str], None]

@@ -20,21 +20,17 @@ from lab.settings.settings import Settings
 from projector.dictionary import shape_from
 from robot.bolt import Bolt
 from robot.characterise import (
-    CharacteriseError,
-    Finding,
     Say,
-    Trial,
-    applied,
     collision_axes,
-    comments_of,
     least_interval,
     least_speed,
     light_latency,
     light_levels,
     motion_latency,
-    neutral,
 )
+from robot.finding import Finding, applied, comments_of
 from robot.profile import RobotProfile, save_profile
+from robot.trial import CharacteriseError, Trial, neutral
 
 RUNS = 20
 LOWEST_BATTERY_V = 3.6  # a tired robot rolls unlike a fresh one

@@ -26,9 +26,11 @@ from lab.store.layout import LIGHT
 from lab.store.reader import SessionReader, numbers_of
 from projector.dictionary import shape_from
 from robot.bolt import Bolt
-from robot.characterise import Finding, Roll, Say, Show, Trial, neutral, roll_runs
+from robot.characterise import Say, Show, roll_runs
+from robot.finding import Finding
 from robot.fitting import Figure, Floats, combine, fit_path, path_of, slope, steady_window
 from robot.profile import RobotProfile, load_profile
+from robot.trial import Roll, Trial, neutral
 from tracking.calibration import Calibration
 from tracking.recorder import Recorder
 from tracking.segment import frames_table

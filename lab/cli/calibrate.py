@@ -54,7 +54,7 @@ def robot(
     from analysis.montecarlo import available_cores
     from lab.calibrate.robot import calibrate_robot, profile_to_update, scales_of_session
     from lab.settings.load import load_settings
-    from robot.characterise import applied, comments_of
+    from robot.finding import applied, comments_of
     from robot.profile import save_profile
 
     if stored is not None and (session is not None or runs is not None):

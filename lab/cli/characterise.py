@@ -11,7 +11,7 @@ import typer
 from lab.cli.output import JsonFlag, QuietFlag, complain, emit, progress_bar, say, show_table
 
 if TYPE_CHECKING:
-    from robot.characterise import Finding
+    from robot.finding import Finding
 
 
 def characterise(

@@ -24,7 +24,7 @@ from lab.calibrate.robot import (
 )
 from lab.cli.calibrate import app, effects_of
 from lab.settings.load import load_settings
-from robot.characterise import applied, comments_of
+from robot.finding import applied, comments_of
 from robot.profile import RobotProfile, load_profile, save_profile
 from robot.virtual.bolt import body_settings
 

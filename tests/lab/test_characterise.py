@@ -16,8 +16,8 @@ from lab.calibrate.characterise import characterise_robot, settings_for
 from lab.cli.characterise import characterise
 from lab.settings.load import load_settings
 from lab.settings.settings import Settings
-from robot.characterise import CharacteriseError
 from robot.profile import RobotProfile, load_profile, save_profile
+from robot.trial import CharacteriseError
 
 HIDDEN = {
     "swapped": RobotProfile(

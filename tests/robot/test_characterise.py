@@ -13,23 +13,19 @@ from shapely.geometry import Point, box
 from lab.clock import run
 from robot.bolt import Bolt
 from robot.characterise import (
-    CharacteriseError,
-    Finding,
-    Trial,
-    applied,
     collision_axes,
-    comments_of,
     least_interval,
     least_speed,
     light_latency,
     light_levels,
     motion_latency,
-    neutral,
     roll_runs,
 )
 from robot.crossings import LevelsError
+from robot.finding import Finding, applied, comments_of
 from robot.fitting import ALL_AXES, Figure, mean_of, slope, steady_window
 from robot.profile import RobotProfile, load_profile, save_profile
+from robot.trial import CharacteriseError, Trial, neutral
 from robot.virtual.body import Body, BodySettings
 from robot.virtual.bolt import VirtualBolt, body_settings
 from robot.virtual.radio import AirSettings, VirtualRadio
